@@ -1,0 +1,211 @@
+"""One participant G of the DAGmap network: composes everything else. Read this first.
+
+Bytes, time and cycles come in as arguments; events and bytes go out as values. There is no clock,
+socket, disk, chance or log in here or below.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from . import messages
+from .config import Config
+from .consensus import Consensus
+from .identity import Identity
+from .ledger import Ledger
+from .messages import Heads, Transactions
+from .model import (
+    FLEET_FRAME,
+    Accepted,
+    AuthorId,
+    Cycle,
+    Event,
+    Floats,
+    Forked,
+    FrameId,
+    Issued,
+    MapChanged,
+    Outgoing,
+    Rejected,
+    Waiting,
+    pose_matrix,
+    quantise_cycle,
+)
+from .observing import Observing
+from .sync import Post, Sync
+from .transaction import Transaction, id_of, parse, seal
+from .wire import Refusal
+from .worldmap import WorldMap, build_map
+
+
+class Agent:
+    """A robot's share in the fleet's map.
+
+    identity: the robot's key. config: its parameters; the fleet-wide ones must be everybody's.
+    """
+
+    def __init__(self, identity: Identity, config: Config | None = None) -> None:
+        self.config = config or Config()
+        self.identity = identity
+        self.ledger = Ledger(self.config)
+        self.consensus = Consensus(self.config, identity.salt)
+        self.observing = Observing(self.config, identity.author, identity.salt)
+        self.sync = Sync(self.ledger, self.config, identity.author)
+        self._outbox: list[Outgoing] = []
+        self._map: WorldMap | None = None
+
+    @classmethod
+    def restore(
+        cls, identity: Identity, config: Config | None, transactions: Iterable[bytes]
+    ) -> Agent:
+        """An agent that holds these transactions (as `Accepted` gave them) and goes on."""
+        agent = cls(identity, config)
+        for data in transactions:
+            agent._through_the_door(data)
+        agent.observing.resume(agent.ledger.chain(identity.author).main)
+        agent._outbox.clear()
+        return agent
+
+    def observe(self, cycle: Cycle, now: float) -> list[Event]:
+        """Take one cycle of the local SLAM. Raises CycleError, and then nothing was taken."""
+        quantised = self.observing.check(quantise_cycle(cycle))
+        self.observing.withdraw(quantised)  # what the SLAM removed or moved
+        self.observing.insert(quantised, now)  # what it added: Alg. 1
+        return self._issue(now)
+
+    def receive(self, data: bytes, now: float) -> list[Event]:
+        """Take any message of any robot. Foreign bytes never raise: they are `Rejected`."""
+        try:
+            sender, message = messages.parse(bytes(data), self.config)
+        except Refusal as refusal:
+            return [Rejected(refusal.reason, refusal.fault, refusal.detail)]
+        if isinstance(message, Transactions):
+            events = [e for item in message.data for e in self._through_the_door(item)]
+            self._post(self.sync.answered(sender, message, now))
+            return events
+        if isinstance(message, Heads):
+            self._post(self.sync.heard(sender, message, now))
+        else:
+            self._post(self.sync.asked(sender, message))
+        return []
+
+    def tick(self, now: float) -> list[Event]:
+        """Let time pass: release what the pacing held back, fold, announce, repair."""
+        events = self._issue(now)
+        events += self._advance()
+        self._post(self.sync.tick(now))
+        return events
+
+    def outbox(self) -> list[Outgoing]:
+        """What is to be sent, handed over and forgotten."""
+        out, self._outbox = self._outbox, []
+        return out
+
+    def digest(self) -> bytes:
+        """32 bytes that are equal on two robots exactly when their maps are."""
+        self._advance()
+        return self.consensus.digest()
+
+    @property
+    def holds_back(self) -> bool:
+        """Whether something that is valid still waits to be issued (the next ticks do it)."""
+        return self.observing.waiting
+
+    @property
+    def map(self) -> WorldMap:
+        """The map of the robot's own component of frames, up to date and immutable."""
+        self._advance()
+        if self._map is None:
+            self._map = build_map(self.consensus, self._component, self.config.fold.cell)
+        return self._map
+
+    def frame(self) -> Floats | None:
+        """(4, 4) pose of the robot's SLAM frame in the fleet frame; None while not placed."""
+        self._advance()
+        placed = self.consensus.frames.get(FrameId(*self._frame))
+        return None if placed is None else pose_matrix(placed[1])
+
+    @property
+    def robots(self) -> dict[str, tuple[Floats, float]]:
+        """Newest pose (4, 4) in this robot's component, and its stamp in s, by robot's name."""
+        self._advance()
+        here, found = self._component, {}
+        for author in self.consensus.authors.values():
+            if author.anchors:
+                anchor = author.anchors[max(author.anchors)]
+                component, pose = self.consensus.placement(author.id, anchor.session)
+                if component == here:
+                    place = pose_matrix(pose) @ pose_matrix(anchor.pose)
+                    found[author.name or author.id.hex()] = (place, anchor.stamp / 1e6)
+        return found
+
+    @property
+    def _component(self) -> FrameId:
+        """Where this robot is; before its first cycle, where it is configured to start."""
+        if FrameId(*self._frame) not in self.consensus.frames and not self.observing.cycles:
+            return FLEET_FRAME if self.config.start_pose is not None else FrameId(*self._frame)
+        return self.consensus.placement(*self._frame)[0]
+
+    @property
+    def _frame(self) -> tuple[AuthorId, int]:
+        return self.identity.author, self.observing.session
+
+    def _issue(self, now: float) -> list[Event]:
+        """Section 4.2: seal what is valid and may go out, and take it through the door."""
+        events: list[Event] = []
+        me = self.identity.author
+        if self.ledger.chain(me).cut is not None:
+            return events  # the key was used twice: nothing it signs counts any more
+        for payload in self.observing.payloads(now, self.ledger.features(me)):
+            main = self.ledger.chain(me).main
+            previous = main[-1].id if main else None
+            tips = self.ledger.tips(me, self.config.transaction.max_references)
+            lamport = self.ledger.lamport_after((*tips, *([previous] if previous else [])))
+            data = seal(self.identity, self.config, len(main), previous, lamport, tips, payload)
+            bundles = 0 if payload.bundle is None else len(payload.bundle.cores())
+            events += self._through_the_door(data)
+            id_ = self.ledger.chain(me).main[-1].id
+            events.append(Issued(id_, payload.features, bundles, len(data)))
+            self._post([(Transactions((data,)), None)])
+        return events
+
+    def _through_the_door(self, data: bytes) -> list[Event]:
+        """The one door: own and foreign transactions alike are judged, kept and folded."""
+        if self.ledger.holds(id_of(data)):
+            return []
+        try:
+            transaction = parse(data, self.config)
+        except Refusal as refusal:
+            return [Rejected(refusal.reason, refusal.fault, refusal.detail)]
+        outcome = self.ledger.add(transaction)
+        events: list[Event] = []
+        for author, sequence in outcome.forked:
+            self.consensus.cut(author, sequence)
+            events.append(Forked(author, sequence))
+            proof = self.ledger.chain(author).proof or ()  # kept like what was accepted
+            events += [Accepted(tx.id, tx.data) for tx in proof if tx.id not in self.ledger]
+        for tx in outcome.accepted:
+            self._fold(tx)
+            events.append(Accepted(tx.id, tx.data))
+        if outcome.missing is not None:
+            events.append(Waiting(transaction.id, outcome.missing))
+        events += [Rejected(r.reason, r.fault, r.detail) for r in outcome.refused]
+        return events
+
+    def _fold(self, tx: Transaction) -> None:
+        if self.ledger.counts(tx):
+            self.consensus.add(tx)
+        else:
+            tx.drop_columns()
+        self._map = None
+
+    def _advance(self) -> list[Event]:
+        if not self.consensus.pending:
+            return []
+        self._map = None
+        return [MapChanged(*self.consensus.advance())]
+
+    def _post(self, posts: Iterable[Post]) -> None:
+        me = self.identity.author
+        for message, to in posts:
+            self._outbox.append(Outgoing(messages.encode(message, self.config, me), to))

@@ -1,0 +1,213 @@
+"""Every parameter in one frozen tree, checked when it is made. TOML files are read by msgspec.
+
+Lengths are metres and times seconds here, as people write them; the properties ending in `_mm`
+are what the integer core uses.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from .model import LIMIT_MM, ConfigError, CycleError, quantise_pose
+
+
+class _Checked(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A frozen group of parameters; `_require` names the one that is wrong and what is wanted."""
+
+    def _require(self, holds: bool, name: str, wanted: str) -> None:
+        if not holds:
+            value = getattr(self, name)
+            raise ConfigError(f"{type(self).__name__}: {name} = {value!r}, but {wanted}")
+
+    def _require_range(self, name: str, low: float, high: float) -> None:
+        value = getattr(self, name)
+        holds = isinstance(value, (int, float)) and not isinstance(value, bool)
+        self._require(holds and low <= value <= high, name, f"{low} to {high} is wanted")
+
+
+class GraphConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Section 4.1: the adjacency DAG. `n_p`, `n_c_max` are fleet-wide: receivers check them."""
+
+    n_p: int = 2  # N_p, parents of a node at most
+    n_c: int = 2  # N_c, children at which a node leaves the terminals; the start value
+    n_c_max: int = 8  # the bound within which the controller moves N_c
+    v_th: int = 3  # V_th: a node whose validity exceeds it becomes the core of a bundle
+    reference_pitch: float = 0.05  # m, of the lattice of reference nodes
+    max_parent_distance: float | None = 0.15  # m; None: parents may be any distance away
+    issued_validity: Literal["inherit", "reset"] = "inherit"
+
+    def __post_init__(self) -> None:
+        self._require_range("n_p", 1, 8)
+        self._require_range("n_c", 1, 255)
+        self._require_range("n_c_max", 1, 255)
+        self._require(
+            self.n_c >= self.n_p,
+            "n_c",
+            f"N_c >= N_p = {self.n_p} is needed: below it the terminals run dry",
+        )
+        self._require(self.n_c_max >= self.n_c, "n_c_max", f"at least n_c = {self.n_c} is wanted")
+        self._require_range("v_th", 0, 1 << 62)
+        self._require_range("reference_pitch", 0.01, 1000.0)
+        if self.max_parent_distance is not None:
+            self._require_range("max_parent_distance", 0.001, 2 * LIMIT_MM / 1000)
+
+    @property
+    def pitch_mm(self) -> int:
+        return round(self.reference_pitch * 1000)
+
+    @property
+    def reach_mm(self) -> int:
+        """Largest distance to a parent, mm; -1 where unlimited."""
+        return -1 if self.max_parent_distance is None else round(self.max_parent_distance * 1000)
+
+
+class IssuanceConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Section 4.2 and Eq. (6): how much goes out, and when."""
+
+    features_per_bundle: int = 1400  # N'_f: what a bundle holds at most; the furthest are cut
+    features_per_transaction: int = 1400  # so that a transaction fits in one message
+    features_per_second: float | None = None  # the robot's budget; None: as fast as they are valid
+    seal_period: float = 0.25  # s between transactions under a budget, so that envelopes stay few
+
+    def __post_init__(self) -> None:
+        self._require_range("features_per_bundle", 1, 1 << 20)
+        self._require_range("features_per_transaction", 1, 1400)
+        self._require_range("seal_period", 0.0, 3600.0)
+        if self.features_per_second is not None:
+            self._require_range("features_per_second", 0.1, 1e9)
+
+
+class TransactionConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Section 4.2: the envelope. Fleet-wide, since every receiver judges by it."""
+
+    proof_of_work_bits: int = 6  # hashcash: 2^bits hashes to issue, one to check
+    max_references: int = 2  # tips of other authors that a transaction refers to
+
+    def __post_init__(self) -> None:
+        self._require_range("proof_of_work_bits", 0, 24)
+        self._require_range("max_references", 0, 16)
+
+
+class FoldConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Section 4.3: the map consensus. All of it is fleet-wide."""
+
+    preset: Literal["default", "paper"] = "default"
+    delta: float = 0.05  # m: observations within it are twins (Algorithm 2's delta)
+    witnesses: int = 2  # authors that a confirmed node needs
+    hit_say: int = 2  # what one author's hits count for in one node, at most
+    miss_say: int = 1  # what one author's misses count for in one node, at most
+    cell: float = 0.10  # m: cell of the ray evidence
+    max_ray: float = 5.0  # m: a ray is walked so far from its sensor
+
+    def __post_init__(self) -> None:
+        self._require_range("delta", 0.001, 10.0)
+        self._require_range("witnesses", 1, 1000)
+        self._require_range("hit_say", 1, 1000)
+        self._require_range("miss_say", 0, 1000)
+        self._require_range("cell", 0.005, 10.0)
+        self._require_range("max_ray", 0.0, 100.0)
+        self._require(
+            self.max_ray / self.cell <= 4096, "max_ray", f"at most 4096 cells of {self.cell} m"
+        )
+
+    @property
+    def delta_mm(self) -> int:
+        return round(self.delta * 1000)
+
+    @property
+    def cell_mm(self) -> int:
+        return round(self.cell * 1000)
+
+    @property
+    def max_ray_mm(self) -> int:
+        return round(self.max_ray * 1000)
+
+
+class LedgerConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Bounds on what is kept for others; a bound never decides what is valid."""
+
+    waiting_transactions: int = 4096  # the waiting room: transactions without their references
+    waiting_bytes: int = 64 << 20
+
+    def __post_init__(self) -> None:
+        self._require_range("waiting_transactions", 1, 1 << 24)
+        self._require_range("waiting_bytes", 1 << 16, 1 << 40)
+
+
+class SyncConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Spreading and repair."""
+
+    announce_period: float = 1.0  # s between announcements of the heads
+    retry_period: float = 1.0  # s after which an unanswered question is asked again
+    chunk_bytes: int = 256 << 10  # an answer holds so much at most; the asker then asks on
+
+    def __post_init__(self) -> None:
+        self._require_range("announce_period", 0.01, 3600.0)
+        self._require_range("retry_period", 0.01, 3600.0)
+        self._require_range("chunk_bytes", 1 << 16, 1 << 30)
+
+
+class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """All parameters of one participant.
+
+    fleet: name of the fleet. Its hash, with that of the fleet-wide parameters, heads every message.
+    name: what people call this robot; empty: the hexadecimal author id.
+    start_pose: (4, 4) rows of the robot's first SLAM frame in the fleet frame, metres, published as
+        a link; default identity: the robots share one frame. None: unknown.
+    same_origin: whether a new session of the SLAM starts in the frame of the one before.
+    """
+
+    fleet: str = "dagmap"
+    name: str = ""
+    start_pose: tuple[tuple[float, float, float, float], ...] | None = (
+        (1.0, 0.0, 0.0, 0.0),
+        (0.0, 1.0, 0.0, 0.0),
+        (0.0, 0.0, 1.0, 0.0),
+        (0.0, 0.0, 0.0, 1.0),
+    )
+    same_origin: bool = False
+    graph: GraphConfig = GraphConfig()
+    issuance: IssuanceConfig = IssuanceConfig()
+    transaction: TransactionConfig = TransactionConfig()
+    fold: FoldConfig = FoldConfig()
+    ledger: LedgerConfig = LedgerConfig()
+    sync: SyncConfig = SyncConfig()
+
+    def __post_init__(self) -> None:
+        self._require(len(self.name.encode()) <= 64, "name", "at most 64 bytes of UTF-8 are wanted")
+        self._require(self.name.isprintable(), "name", "printable characters are wanted")
+        if self.start_pose is not None:
+            try:
+                quantise_pose(self.start_pose, "Config: start_pose")
+            except CycleError as error:
+                raise ConfigError(str(error)) from None
+
+    @property
+    def fleet_id(self) -> bytes:
+        """8 bytes that name the fleet."""
+        return hashlib.blake2b(b"dagmap fleet 1\0" + self.fleet.encode(), digest_size=8).digest()
+
+    @property
+    def parameters_id(self) -> bytes:
+        """8 bytes over all that every robot must hold alike, or it would compute another map."""
+        graph = [self.graph.n_p, self.graph.n_c_max]
+        shared = msgspec.json.encode([self.fold, self.transaction, graph])
+        return hashlib.blake2b(b"dagmap parameters 1\0" + shared, digest_size=8).digest()
+
+
+def load_config(path: Path) -> Config:
+    """Read a TOML file. Raises ConfigError that names the file, the key and what is wanted."""
+    try:
+        return msgspec.toml.decode(path.read_bytes(), type=Config)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: not a text file in UTF-8") from None
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    except msgspec.DecodeError as error:
+        raise ConfigError(f"{path}: not valid TOML ({error})") from None

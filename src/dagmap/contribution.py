@@ -1,0 +1,196 @@
+"""What one transaction adds to the map: its features, carried into the fleet's frames.
+
+Only the placed positions are kept (15 B a feature with the colour); when a pose changes, the
+positions in the sensor's frame are decoded again from the transaction's bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+
+from .config import Config
+from .fold import Block
+from .kernels.columns import grown
+from .kernels.geometry import apply_pose
+from .model import AuthorId, Bools, FrameId, Int32s, Int64s
+from .payload import Anchor, Link, Sighting
+from .transaction import Transaction
+
+Placement: TypeAlias = tuple[FrameId, Int32s]  # component, (7,) pose of a frame in it
+Frames: TypeAlias = Callable[[AuthorId, int], Placement]  # of an author's session
+Key: TypeAlias = tuple[int, AuthorId, int]  # the canonical order
+
+
+@dataclass(slots=True)
+class Author:
+    """What the counted transactions of one author say, beside features."""
+
+    id: AuthorId
+    index: int  # local and dense; nothing that others see depends on it
+    name: str | None = None
+    anchors: dict[int, Anchor] = field(default_factory=dict)  # newest, by cycle
+    retracted: Bools = field(default_factory=lambda: np.zeros(0, np.bool_))  # by feature number
+    links: dict[tuple[FrameId, FrameId], Link] = field(default_factory=dict)
+    bases: list[int] = field(default_factory=list)  # first feature number of each contribution
+    keys: list[Key] = field(default_factory=list)  # of the same contributions
+    seen_in: dict[int, list[Key]] = field(default_factory=dict)  # contributions by cycle
+
+    def retract(self, numbers: Int64s) -> list[Key]:
+        """Mark features (ascending numbers) as withdrawn; the contributions that held them."""
+        if len(numbers) == 0:
+            return []
+        self.retracted = grown(self.retracted, int(numbers[-1]) + 1, False)
+        self.retracted[numbers] = True
+        hit = np.searchsorted(np.array(self.bases, np.int64), numbers, side="right") - 1
+        return [self.keys[i] for i in np.unique(hit).tolist()]
+
+
+@dataclass(slots=True, eq=False)
+class Part:
+    """What a contribution adds to one component of frames, as it was last placed."""
+
+    component: FrameId
+    alive: Bools | None  # None: all features
+    origins: Int32s  # (s, 3) sensor position of each segment, mm in the component
+    sightings: tuple[Sighting, ...]
+
+
+class Contribution:
+    """The features and sightings of one transaction, placed by the newest poses."""
+
+    __slots__ = (
+        "author",
+        "base",
+        "color",
+        "colored",
+        "cores",
+        "cycles",
+        "fresh",
+        "parents",
+        "parts",
+        "sightings",
+        "starts",
+        "transaction",
+        "xyz",
+    )
+
+    def __init__(self, tx: Transaction, author: Author, config: Config) -> None:
+        bundle, paper = tx.payload.bundle, config.fold.preset == "paper"
+        self.transaction, self.author = tx, author
+        self.sightings = tx.payload.sightings
+        self.parts: list[Part] = []
+        self.fresh = True  # xyz still holds positions in the sensors' frames
+        self.parents: Int64s | None = None
+        self.cores = np.zeros(0, np.int64)
+        if bundle is None:
+            self.base = 0
+            self.xyz, self.color = np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8)
+            self.starts, self.cycles = np.zeros(1, np.int64), np.zeros(0, np.int64)
+            self.colored = np.zeros(0, np.uint8)
+            return
+        self.base, self.xyz, self.color = bundle.base, bundle.position, bundle.color
+        self.starts, self.cycles, self.colored = bundle.starts, bundle.cycles, bundle.colored
+        if paper:
+            self.parents, self.cores = bundle.parents, bundle.cores()
+
+    @property
+    def key(self) -> Key:
+        return self.transaction.key
+
+    @property
+    def touched_cycles(self) -> set[int]:
+        """Cycles whose anchors this contribution depends on."""
+        return {*self.cycles.tolist(), *(sighting.cycle for sighting in self.sightings)}
+
+    def place(self, frames: Frames, config: Config) -> None:
+        """Carry every feature from its sensor's frame into its component, in integers.
+
+        Left out is what was retracted, has no known anchor, or leaves +-2^29 mm on the way.
+        """
+        position = self._positions(config)
+        alive = np.ones(len(position), np.bool_)
+        gone = self.author.retracted[self.base : self.base + len(position)]
+        alive[: len(gone)] &= ~gone
+        self.xyz = np.zeros_like(position)
+        origins = np.zeros((len(self.cycles), 3), np.int32)
+        homes: list[FrameId | None] = []
+        for s, cycle in enumerate(self.cycles.tolist()):
+            rows = slice(int(self.starts[s]), int(self.starts[s + 1]))
+            home = self._home(cycle, frames)
+            if home is None:
+                alive[rows] = False
+                homes.append(None)
+                continue
+            anchor, (component, pose) = home
+            _through(anchor.pose, pose, position[rows], self.xyz[rows], alive[rows])
+            _through(anchor.pose, pose, np.zeros((1, 3), np.int32), origins[s : s + 1], None)
+            homes.append(component)
+        self.parts = self._split(homes, alive, origins, frames)
+
+    def block(self, part: Part) -> Block:
+        """The part in the form that a fold takes."""
+        sizes = np.diff(self.starts)
+        numbers = [s.numbers for s in part.sightings]
+        cycles = [np.full(len(s.numbers), s.cycle, np.int32) for s in part.sightings]
+        return Block(
+            author=self.author.index,
+            base=self.base,
+            xyz=self.xyz,
+            alive=self.alive(part),
+            cycle=np.repeat(self.cycles, sizes).astype(np.int32),
+            color=self.color,
+            colored=np.repeat(self.colored, sizes).astype(np.bool_),
+            parents=self.parents,
+            cores=self.cores,
+            sightings=np.concatenate([np.zeros(0, np.int64), *numbers]),
+            sighting_cycle=np.concatenate([np.zeros(0, np.int32), *cycles]),
+        )
+
+    def alive(self, part: Part) -> Bools:
+        return np.ones(len(self.xyz), np.bool_) if part.alive is None else part.alive
+
+    def _positions(self, config: Config) -> Int32s:
+        if self.fresh:
+            self.fresh = False
+            return self.xyz
+        bundle = self.transaction.decode_again(config).bundle
+        return self.xyz if bundle is None else bundle.position
+
+    def _home(self, cycle: int, frames: Frames) -> tuple[Anchor, Placement] | None:
+        anchor = self.author.anchors.get(cycle)
+        return None if anchor is None else (anchor, frames(self.author.id, anchor.session))
+
+    def _split(
+        self, homes: list[FrameId | None], alive: Bools, origins: Int32s, frames: Frames
+    ) -> list[Part]:
+        """One part per component; nearly always there is one."""
+        again: dict[FrameId, list[Sighting]] = {}
+        for sighting in self.sightings:
+            home = self._home(sighting.cycle, frames)
+            if home is not None:
+                again.setdefault(home[1][0], []).append(sighting)
+        components = sorted({*again, *(home for home in homes if home is not None)})
+        parts = []
+        for component in components:
+            mine = np.repeat(np.array([h == component for h in homes], np.bool_), self._sizes())
+            mine &= alive
+            mask = None if bool(mine.all()) else mine
+            parts.append(Part(component, mask, origins, tuple(again.get(component, ()))))
+        return parts
+
+    def _sizes(self) -> Int64s:
+        return np.diff(self.starts)
+
+
+def _through(
+    anchor: Int32s, frame: Int32s, points: Int32s, out: Int32s, alive: Bools | None
+) -> None:
+    """Sensor to SLAM frame to component; `alive` is cleared where a point leaves the range."""
+    inside = np.ones(len(points), np.bool_) if alive is None else alive
+    between = np.empty_like(points)
+    apply_pose(anchor, points, between, inside)
+    apply_pose(frame, between, out, inside)

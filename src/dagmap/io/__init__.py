@@ -1,0 +1,1 @@
+"""What touches the world: disk, figures, recordings. The core never imports from here."""

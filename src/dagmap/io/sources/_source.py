@@ -1,0 +1,76 @@
+"""What all readers share: the protocol, the options, and errors that name the file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from ...model import ConfigError, Cycle, CycleError, RecordingError, quantise_cycle
+
+
+class Source(Protocol):
+    """A recording. It can be iterated again, and gives the same cycles."""
+
+    name: str  # the folder's name or the file's stem: what the robot is called
+
+    def __len__(self) -> int:
+        """Cycles that iterating gives."""
+
+    def __iter__(self) -> Iterator[Cycle]:
+        """The cycles, by stamp within each session. Raises RecordingError."""
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """See `open_source`. Raises ConfigError where one is out of its range."""
+
+    camera: Path | None = None
+    max_features: int = 1000
+    max_depth: float | None = None  # m
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.max_features <= 1 << 20:
+            raise ConfigError(f"max_features = {self.max_features}, but 1 to 2^20 is wanted")
+        if self.max_depth is not None and not self.max_depth > 0:
+            raise ConfigError(f"max_depth = {self.max_depth}, but more than 0 m is wanted")
+
+
+def folder_name(path: Path) -> str:
+    """The last part of a path, also of `.` and `robot1/`; links keep their own name."""
+    return Path(os.path.abspath(path)).name
+
+
+def checked(cycle: Cycle, path: Path) -> Cycle:
+    """The same cycle. Raises RecordingError naming the file where an agent would refuse it."""
+    try:
+        quantise_cycle(cycle)
+    except CycleError as error:
+        raise RecordingError(f"{path}: {error}") from None
+    return cycle
+
+
+def read_bytes(path: Path) -> bytes:
+    """A whole file. Raises RecordingError where it is missing or cannot be read."""
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise RecordingError(f"{path}: missing; the recording needs it") from None
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def read_rows(path: Path) -> list[tuple[int, list[str]]]:
+    """Rows of a text file of the TUM benchmark: (line number from 1, words). `#` is a comment."""
+    try:
+        text = read_bytes(path).decode()
+    except UnicodeDecodeError:
+        raise RecordingError(f"{path}: not a text file in UTF-8; write it anew") from None
+    rows = ((number, line.strip()) for number, line in enumerate(text.splitlines(), 1))
+    return [
+        (number, line.replace(",", " ").split())
+        for number, line in rows
+        if line and not line.startswith("#")
+    ]

@@ -1,0 +1,218 @@
+"""A folder as the TUM RGB-D benchmark lays it out: pictures, depth, and the poses of a SLAM."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from ...model import Cycle, Floats, RecordingError
+from ._rgbd import FrontEnd, import_cv2, load_camera
+from ._source import Options, checked, folder_name, read_rows
+
+UNDERSTANDS = "a TUM RGB-D folder (rgb/, depth/, groundtruth.txt, camera.json)"
+_SLACK = 0.020 + 1e-9  # s: stamps no further apart are of one moment
+_PARTS = ("rgb", "depth", "groundtruth.txt", "associations.txt", "rgb.txt", "depth.txt")
+
+
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    stamp: float  # of the depth picture, s
+    color: Path
+    depth: Path
+    line: str = ""  # where it is named, for errors
+
+
+def matches(path: Path) -> bool:
+    """Whether this is a folder with any of the benchmark's parts."""
+    return path.is_dir() and any((path / part).exists() for part in _PARTS)
+
+
+def open(path: Path, options: Options) -> TumFolder:  # noqa: A001
+    """Open a folder. Raises RecordingError."""
+    return TumFolder(path, options)
+
+
+class TumFolder:
+    """The frames of a folder that have a pose, as cycles of ORB features with depth.
+
+    dropped: frames that were left out because no pose lies within 20 ms of their depth.
+    """
+
+    def __init__(self, path: Path, options: Options) -> None:
+        self.name = folder_name(path)
+        self._path, self._options = path, options
+        for part in ("rgb", "depth"):
+            if not (path / part).is_dir():
+                raise RecordingError(
+                    f"{path}: no folder {part}/; DAGmap needs pictures with depth, in rgb/ and "
+                    "depth/"
+                )
+        own, named = path / "camera.json", options.camera
+        if named is None and not own.exists():
+            raise RecordingError(
+                f"{path}: no camera parameters; put a camera.json into the folder or name one "
+                "with --camera FILE"
+            )
+        self._camera = load_camera(own if named is None else named)
+        self._cv2 = import_cv2(path)
+        frames = _frames(path)
+        placed = _placed(frames, path / "groundtruth.txt")
+        self.dropped = len(frames) - len(placed)
+        if not placed:
+            raise RecordingError(
+                f"{path}: none of {len(frames)} frames has a pose within 20 ms in "
+                "groundtruth.txt; check that both use the same clock"
+            )
+        self._placed = placed
+
+    def __len__(self) -> int:
+        return len(self._placed)
+
+    def __iter__(self) -> Iterator[Cycle]:
+        front = FrontEnd(self._cv2, self._camera, self._options)
+        for frame, pose in self._placed:
+            points, colors = front.points(frame.color, frame.depth)
+            yield checked(Cycle(frame.stamp, pose, points, colors=colors), self._path)
+
+
+def _frames(path: Path) -> list[_Frame]:
+    """All pairs of pictures by the stamp of the depth."""
+    named = path / "associations.txt"
+    frames = _associated(path, named) if named.exists() else _matched(path)
+    if not frames:
+        raise RecordingError(
+            f"{path}: an empty recording; no picture in rgb/ has one in depth/ within 20 ms"
+        )
+    for frame in frames:
+        for picture in (frame.color, frame.depth):
+            if not picture.is_file():
+                by = f", named in {frame.line}" if frame.line else ""
+                raise RecordingError(f"{picture}: missing{by}; copy it or drop its frame")
+    return frames
+
+
+def _associated(path: Path, file: Path) -> list[_Frame]:
+    """The frames that associations.txt names: stamp, rgb, stamp, depth."""
+    frames: list[_Frame] = []
+    for number, words in read_rows(file):
+        line = f"{file}, line {number}"
+        if len(words) != 4:
+            raise RecordingError(f"{line}: `stamp rgb stamp depth` is wanted, not {words}")
+        _number(words[0], line)
+        frames.append(_Frame(_number(words[2], line), path / words[1], path / words[3], line))
+    _require_rising([(frame.stamp, frame.line) for frame in frames])
+    return frames
+
+
+def _matched(path: Path) -> list[_Frame]:
+    """Each depth picture with the nearest colour picture, if each is the other's nearest."""
+    colors, depths = _list(path, "rgb"), _list(path, "depth")
+    if not colors or not depths:
+        return []
+    color_stamps = np.array([stamp for stamp, _ in colors])
+    depth_stamps = np.array([stamp for stamp, _ in depths])
+    frames = []
+    for (stamp, depth), i in zip(depths, _nearest(color_stamps, depth_stamps), strict=True):
+        back = _nearest(depth_stamps, color_stamps[i : i + 1])[0]
+        if abs(colors[i][0] - stamp) <= _SLACK and depths[back][1] == depth:
+            frames.append(_Frame(stamp, colors[i][1], depth))
+    return frames
+
+
+def _list(path: Path, part: str) -> list[tuple[float, Path]]:
+    """(stamp, picture) from rgb.txt or depth.txt, else from the names of the files."""
+    file = path / f"{part}.txt"
+    rows: list[tuple[float, str]] = []
+    pictures: list[tuple[float, Path]] = []
+    if file.exists():
+        for number, words in read_rows(file):
+            line = f"{file}, line {number}"
+            if len(words) != 2:
+                raise RecordingError(f"{line}: `stamp file` is wanted, not {words}")
+            rows.append((_number(words[0], line), line))
+            pictures.append((rows[-1][0], path / words[1]))
+        _require_rising(rows)
+        return pictures
+    remedy = f"name files by their stamp, or write {part}.txt or associations.txt"
+    for picture in (path / part).iterdir():
+        if picture.is_file() and not picture.name.startswith("."):
+            pictures.append((_number(picture.stem, f"{picture} ({remedy})"), picture))
+    pictures.sort()
+    _require_rising([(stamp, str(picture)) for stamp, picture in pictures])
+    return pictures
+
+
+def _placed(frames: list[_Frame], file: Path) -> list[tuple[_Frame, Floats]]:
+    """The frames with the pose nearest to their depth, where one lies within 20 ms."""
+    stamps, poses = _trajectory(file)
+    nearest = _nearest(stamps, np.array([frame.stamp for frame in frames]))
+    return [
+        (frame, poses[i])
+        for frame, i in zip(frames, nearest, strict=True)
+        if abs(stamps[i] - frame.stamp) <= _SLACK
+    ]
+
+
+def _trajectory(file: Path) -> tuple[Floats, Floats]:
+    """Stamps (M,) and poses (M, 4, 4) of groundtruth.txt: stamp tx ty tz qx qy qz qw."""
+    stamps, poses = [], []
+    for number, words in read_rows(file):
+        line = f"{file}, line {number}"
+        if len(words) != 8:
+            raise RecordingError(f"{line}: `stamp tx ty tz qx qy qz qw` is wanted, not {words}")
+        stamp, *values = (_number(word, line) for word in words)
+        stamps.append((stamp, line))
+        poses.append(_pose(values, line))
+    if not stamps:
+        raise RecordingError(f"{file}: no poses; a line `stamp tx ty tz qx qy qz qw` each")
+    _require_rising(stamps)
+    return np.array([stamp for stamp, _ in stamps]), np.array(poses)
+
+
+def _pose(values: list[float], line: str) -> Floats:
+    """(4, 4) from translation and quaternion."""
+    quaternion = np.array(values[3:])
+    length = float(np.linalg.norm(quaternion))
+    if not 0.9 < length < 1.1:
+        raise RecordingError(f"{line}: a quaternion of length {length:.3g}; 1 is wanted")
+    x, y, z, w = quaternion / length
+    pose = np.eye(4)
+    pose[:3, 3] = values[:3]
+    pose[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return pose
+
+
+def _number(word: str, line: str) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise RecordingError(f"{line}: {word!r} is not a finite number")
+    return value
+
+
+def _require_rising(stamps: list[tuple[float, str]]) -> None:
+    for (before, _), (stamp, line) in pairwise(stamps):
+        if stamp <= before:
+            raise RecordingError(
+                f"{line}: the stamp {stamp} does not come after {before}; stamps must rise, sort "
+                "the lines and drop doubles"
+            )
+
+
+def _nearest(rising: Floats, stamps: Floats) -> list[int]:
+    """Index of the nearest of some rising stamps, the earlier one of two as near."""
+    right = np.minimum(np.searchsorted(rising, stamps), len(rising) - 1)
+    left = np.maximum(right - 1, 0)
+    later = np.abs(rising[right] - stamps) < np.abs(rising[left] - stamps)
+    return [int(i) for i in np.where(later, right, left)]

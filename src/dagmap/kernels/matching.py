@@ -1,0 +1,245 @@
+"""Section 4.3, preset `default`: observations meet the nearest seed within delta, with undo.
+
+Seeds (a node's first observation) never move and lie more than delta apart, so a grid cell holds a
+bounded number of them against anybody, and hits never touch the grid. A bucket is a chain of
+nodes, the newest first; nodes of other cells that share it are told apart by their distance alone.
+Whatever is created last is the head of its chain, so undoing in reverse order only pops heads.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from ..model import Bools, Int32s, Int64s, Uint8s
+from .jit import kernel
+
+# Hashes are a x + b y + c z + d modulo the prime p with secret a, b, c, d: whatever coordinates
+# somebody chooses, two of them collide with probability 1/p (Carter and Wegman, 1979).
+_P = (1 << 31) - 1
+_LOW = 1 << 29  # makes coordinates positive; products stay below 2^62
+X, Y, Z, OLDER = 0, 1, 2, 3  # columns of Nodes.seed; OLDER: next node of the same bucket
+AUTHOR, HITS, CYCLE, NEXT = 0, 1, 2, 3  # columns of Nodes.entries
+NODES, ENTRIES = 0, 1  # places in Nodes.sizes
+FIRST_SEEN = -1  # undo: the observation made the author's entry at the node
+NOT_COUNTED = -2  # undo: no hit, the author's cycle had counted already
+
+
+class Nodes(NamedTuple):
+    """The map of one fold; rows beyond `sizes` are spare."""
+
+    sizes: Int64s  # (2,) nodes and entries in use
+    key: Int64s  # (4,) multipliers a, b, c and offset d of the hash, below p
+    buckets: Int32s  # (B,) newest node of each bucket or -1; B a power of two, at least 8
+    seed: Int32s  # (N, 4) x y z mm, and the next older node of the bucket
+    offset: Int64s  # (N, 3) sum over the observations of their offsets from the seed, mm
+    count: Int32s  # (N,) observations
+    color: Int64s  # (N, 3) sum of the colours
+    color_count: Int32s  # (N,) observations with a colour
+    first: Int32s  # (N,) newest entry of the node
+    entries: Int32s  # (E, 4) author, hits, last counted cycle, next entry of the node or -1
+
+
+class Seen(NamedTuple):
+    """What a transaction contributes; see `fold.Block`."""
+
+    xyz: Int32s
+    alive: Bools
+    cycle: Int32s
+    color: Uint8s
+    colored: Bools
+    sightings: Int64s
+    sighting_cycle: Int32s
+
+
+@kernel
+def _bucket(key: Int64s, mask: int, cx: int, cy: int, cz: int) -> int:
+    """Bucket of a cell: a hash of its octet (2^3 cells), the cell in the octet in the low bits."""
+    u = int(key[0]) * ((cx >> 1) + _LOW)
+    v = int(key[1]) * ((cy >> 1) + _LOW)
+    w = int(key[2]) * ((cz >> 1) + _LOW)
+    h = int(key[3]) + (u & _P) + (u >> 31) + (v & _P) + (v >> 31) + (w & _P) + (w >> 31)
+    h = (h & _P) + (h >> 31)
+    if h >= _P:
+        h -= _P
+    return ((h << 3) | (cx & 1) | ((cy & 1) << 1) | ((cz & 1) << 2)) & mask
+
+
+@kernel
+def find_twin(nodes: Nodes, shift: int, reach: int, x: int, y: int, z: int) -> int:
+    """Node with the nearest seed within `reach` mm, ties to the lower id; -1 where there is none.
+
+    2^shift mm is the cell edge, at least 2 * reach: so at most two cells an axis are touched.
+    """
+    buckets, seed, key = nodes.buckets, nodes.seed, nodes.key
+    mask = buckets.shape[0] - 1
+    twin = -1
+    best = reach * reach
+    for cz in range((z - reach) >> shift, ((z + reach) >> shift) + 1):
+        for cy in range((y - reach) >> shift, ((y + reach) >> shift) + 1):
+            for cx in range((x - reach) >> shift, ((x + reach) >> shift) + 1):
+                node = int(buckets[_bucket(key, mask, cx, cy, cz)])
+                while node >= 0:
+                    dx = int(seed[node, X]) - x
+                    dy = int(seed[node, Y]) - y
+                    dz = int(seed[node, Z]) - z
+                    d2 = dx * dx + dy * dy + dz * dz
+                    if d2 < best or (d2 == best and (twin < 0 or node < twin)):
+                        best = d2
+                        twin = node
+                    node = int(seed[node, OLDER])
+    return twin
+
+
+@kernel
+def _create(nodes: Nodes, shift: int, x: int, y: int, z: int) -> int:
+    node = int(nodes.sizes[NODES])
+    mask = nodes.buckets.shape[0] - 1
+    bucket = _bucket(nodes.key, mask, x >> shift, y >> shift, z >> shift)
+    nodes.seed[node, X] = x
+    nodes.seed[node, Y] = y
+    nodes.seed[node, Z] = z
+    nodes.seed[node, OLDER] = nodes.buckets[bucket]
+    nodes.buckets[bucket] = node
+    nodes.offset[node, :] = 0
+    nodes.count[node] = 0
+    nodes.color[node, :] = 0
+    nodes.color_count[node] = 0
+    nodes.first[node] = -1
+    nodes.sizes[NODES] = node + 1
+    return node
+
+
+@kernel
+def _discard_newest(nodes: Nodes, shift: int) -> None:
+    node = int(nodes.sizes[NODES]) - 1
+    cx = int(nodes.seed[node, X]) >> shift
+    cy = int(nodes.seed[node, Y]) >> shift
+    cz = int(nodes.seed[node, Z]) >> shift
+    bucket = _bucket(nodes.key, nodes.buckets.shape[0] - 1, cx, cy, cz)
+    nodes.buckets[bucket] = nodes.seed[node, OLDER]
+    nodes.sizes[NODES] = node
+
+
+@kernel
+def _hit(nodes: Nodes, node: int, author: int, cycle: int) -> int:
+    """Count a hit once per author and cycle. Returns what `_take_back` needs."""
+    entry = int(nodes.first[node])
+    while entry >= 0:
+        if int(nodes.entries[entry, AUTHOR]) == author:
+            last = int(nodes.entries[entry, CYCLE])
+            if cycle <= last:
+                return NOT_COUNTED
+            nodes.entries[entry, HITS] += 1
+            nodes.entries[entry, CYCLE] = cycle
+            return last
+        entry = int(nodes.entries[entry, NEXT])
+    entry = int(nodes.sizes[ENTRIES])
+    nodes.entries[entry, AUTHOR] = author
+    nodes.entries[entry, HITS] = 1
+    nodes.entries[entry, CYCLE] = cycle
+    nodes.entries[entry, NEXT] = nodes.first[node]
+    nodes.first[node] = entry
+    nodes.sizes[ENTRIES] = entry + 1
+    return FIRST_SEEN
+
+
+@kernel
+def _take_back(nodes: Nodes, node: int, author: int, before: int) -> None:
+    if before == NOT_COUNTED:
+        return
+    entry = int(nodes.first[node])
+    if before == FIRST_SEEN:
+        nodes.first[node] = nodes.entries[entry, NEXT]
+        nodes.sizes[ENTRIES] = entry
+        return
+    while int(nodes.entries[entry, AUTHOR]) != author:
+        entry = int(nodes.entries[entry, NEXT])
+    nodes.entries[entry, HITS] -= 1
+    nodes.entries[entry, CYCLE] = before
+
+
+@kernel
+def _accumulate(nodes: Nodes, node: int, seen: Seen, i: int, sign: int) -> None:
+    nodes.count[node] += sign
+    for axis in range(3):
+        nodes.offset[node, axis] += sign * (int(seen.xyz[i, axis]) - int(nodes.seed[node, axis]))
+    if seen.colored[i]:
+        nodes.color_count[node] += sign
+        for channel in range(3):
+            nodes.color[node, channel] += sign * int(seen.color[i, channel])
+
+
+@kernel
+def apply(
+    nodes: Nodes,
+    shift: int,
+    reach: int,
+    author: int,
+    seen: Seen,
+    base: int,
+    features: Int32s,
+    undo: Int32s,
+) -> None:
+    """Fold one block in. Spare: a node and an entry for each feature, an entry a sighting.
+
+    features: (F,) node of each feature number of the author; rows base.. are written.
+    undo: (n + s,) is written: the last counted cycle before, FIRST_SEEN or NOT_COUNTED.
+    """
+    count = seen.xyz.shape[0]
+    for i in range(count):
+        if not seen.alive[i]:
+            features[base + i] = -1
+            undo[i] = NOT_COUNTED
+            continue
+        x, y, z = int(seen.xyz[i, 0]), int(seen.xyz[i, 1]), int(seen.xyz[i, 2])
+        node = find_twin(nodes, shift, reach, x, y, z)
+        if node < 0:
+            node = _create(nodes, shift, x, y, z)
+        _accumulate(nodes, node, seen, i, 1)
+        features[base + i] = node
+        undo[i] = _hit(nodes, node, author, int(seen.cycle[i]))
+    for j in range(seen.sightings.shape[0]):
+        number = int(seen.sightings[j])
+        undo[count + j] = NOT_COUNTED
+        if 0 <= number < features.shape[0] and features[number] >= 0:
+            cycle = int(seen.sighting_cycle[j])
+            undo[count + j] = _hit(nodes, int(features[number]), author, cycle)
+
+
+@kernel
+def revert(
+    nodes: Nodes,
+    shift: int,
+    author: int,
+    seen: Seen,
+    base: int,
+    features: Int32s,
+    undo: Int32s,
+) -> None:
+    """The exact inverse of the last `apply` that was not reverted, with the same block."""
+    count = seen.xyz.shape[0]
+    for j in range(seen.sightings.shape[0] - 1, -1, -1):
+        number = int(seen.sightings[j])
+        if 0 <= number < features.shape[0] and features[number] >= 0:
+            _take_back(nodes, int(features[number]), author, int(undo[count + j]))
+    for i in range(count - 1, -1, -1):
+        node = int(features[base + i])
+        if node < 0:
+            continue
+        _take_back(nodes, node, author, int(undo[i]))
+        _accumulate(nodes, node, seen, i, -1)
+        if nodes.count[node] == 0:
+            _discard_newest(nodes, shift)
+
+
+@kernel
+def rebuild(nodes: Nodes, shift: int) -> None:
+    """Fill a new, empty array of buckets (all -1); chains come out the newest first again."""
+    mask = nodes.buckets.shape[0] - 1
+    for node in range(int(nodes.sizes[NODES])):
+        cx = int(nodes.seed[node, X]) >> shift
+        cy = int(nodes.seed[node, Y]) >> shift
+        cz = int(nodes.seed[node, Z]) >> shift
+        bucket = _bucket(nodes.key, mask, cx, cy, cz)
+        nodes.seed[node, OLDER] = nodes.buckets[bucket]
+        nodes.buckets[bucket] = node

@@ -1,0 +1,172 @@
+"""What robots say to each other, as bytes: parse or reject.
+
+    "DM" | version 1 | kind 1 | fleet 8 | fold parameters 8 | sender 8 | body | CRC-32 4
+
+The sender is a hint (whom to answer), never a proof: only transactions are signed. Other robots'
+heads are hints too; a false one costs a bounded question.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TypeAlias
+
+from . import wire
+from .config import Config
+from .model import AuthorId, Reason, TransactionId
+from .transaction import MAX_SIZE as MAX_TRANSACTION
+from .wire import Reader, Refusal
+
+VERSION = 1
+MAX_MESSAGE = 60_000  # bytes
+MAX_ECHOES = 8
+_HEAD = 28
+_MAGIC = b"DM"
+
+
+class Kind(IntEnum):
+    """Message kinds of version 1. The numbers are the wire's."""
+
+    TRANSACTIONS = 1
+    HEADS = 2
+    WANT = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Transactions:
+    """Exact bytes of transactions. `more`: the answer was cut here, ask on."""
+
+    data: tuple[bytes, ...]
+    more: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """The end of an author's chain as the sender holds it; `cut` where it holds a fork proof."""
+
+    author: AuthorId
+    length: int  # transactions of the chain that count
+    tip: bytes  # first 8 bytes of the id of the last one, zeros where there is none
+    cut: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Heads:
+    """An announcement. Tokens measure the delay: each comes back with how long it was held."""
+
+    token: int
+    echoes: tuple[tuple[AuthorId, int, int], ...]  # (whose token, token, held microseconds)
+    heads: tuple[Head, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Want:
+    """A question: ranges of chains (author, first, end exclusive), ids, proofs of forks."""
+
+    ranges: tuple[tuple[AuthorId, int, int], ...] = ()
+    ids: tuple[TransactionId, ...] = ()
+    proofs: tuple[AuthorId, ...] = ()
+
+
+Message: TypeAlias = Transactions | Heads | Want
+
+
+def encode(message: Message, config: Config, sender: AuthorId) -> bytes:
+    """The bytes of a message. Raises ValueError where they would exceed MAX_MESSAGE."""
+    kind, body = _encode_body(message)
+    head = _MAGIC + bytes([VERSION, kind]) + config.fleet_id + config.parameters_id + sender
+    data = head + body
+    if len(data) + 4 > MAX_MESSAGE:
+        raise ValueError(f"a message of {len(data) + 4} bytes; at most {MAX_MESSAGE} fit")
+    return data + zlib.crc32(data).to_bytes(4, "little")
+
+
+def parse(data: bytes, config: Config) -> tuple[AuthorId, Message]:
+    """Read foreign bytes as (sender, message). Raises Refusal, nothing else."""
+    if len(data) > MAX_MESSAGE:
+        raise Refusal(Reason.MALFORMED, f"message of {len(data)} bytes")
+    if len(data) < _HEAD + 4:
+        raise Refusal(Reason.TRUNCATED, f"message of {len(data)} bytes")
+    if zlib.crc32(data[:-4]).to_bytes(4, "little") != data[-4:]:
+        raise Refusal(Reason.CHECKSUM)
+    if data[:2] != _MAGIC or data[2] != VERSION:
+        raise Refusal(Reason.VERSION, f"message version {data[2]}")
+    sender = data[20:28]
+    if data[4:12] != config.fleet_id:
+        raise Refusal(Reason.FLEET, f"id {data[4:12].hex()}", sender)
+    if data[12:20] != config.parameters_id:
+        raise Refusal(Reason.PARAMETERS, f"id {data[12:20].hex()}", sender)
+    try:
+        return sender, _decode_body(data[3], Reader(data[_HEAD:-4]), config)
+    except Refusal as refusal:
+        raise Refusal(refusal.reason, refusal.detail, sender) from None
+
+
+def _encode_body(message: Message) -> tuple[Kind, bytes]:
+    if isinstance(message, Transactions):
+        parts = [wire.number(len(data)) + data for data in message.data]
+        return Kind.TRANSACTIONS, bytes([message.more]) + b"".join(parts)
+    if isinstance(message, Heads):
+        return Kind.HEADS, _encode_heads(message)
+    ranges = (a + wire.number(first) + wire.number(end - first) for a, first, end in message.ranges)
+    return Kind.WANT, b"".join(
+        (
+            wire.number(len(message.ranges)),
+            *ranges,
+            wire.number(len(message.ids)),
+            *message.ids,
+            wire.number(len(message.proofs)),
+            *message.proofs,
+        )
+    )
+
+
+def _encode_heads(message: Heads) -> bytes:
+    out = [wire.number(message.token), wire.number(len(message.echoes))]
+    for author, token, held in message.echoes:
+        out.append(author + wire.number(token) + wire.number(held))
+    for head in message.heads:
+        out.append(head.author + wire.number(2 * head.length + head.cut) + head.tip)
+    return b"".join(out)
+
+
+def _decode_body(kind: int, body: Reader, config: Config) -> Message:
+    if kind == Kind.TRANSACTIONS:
+        return _decode_transactions(body)
+    if kind == Kind.HEADS:
+        return _decode_heads(body)
+    if kind == Kind.WANT:
+        return _decode_want(body)
+    raise Refusal(Reason.MALFORMED, f"message of kind {kind}")
+
+
+def _decode_transactions(body: Reader) -> Transactions:
+    more = body.number(1) == 1
+    data = []
+    while body.left:
+        data.append(body.take(body.number(MAX_TRANSACTION)))
+    return Transactions(tuple(data), more)
+
+
+def _decode_heads(body: Reader) -> Heads:
+    token, echoes = body.number(), []
+    for _ in range(body.number(MAX_ECHOES)):
+        echoes.append((body.take(8), body.number(), body.number()))
+    heads = []
+    while body.left:
+        author, packed = body.take(8), body.number(1 << 41)
+        heads.append(Head(author, packed >> 1, body.take(8), bool(packed & 1)))
+    return Heads(token, tuple(echoes), tuple(heads))
+
+
+def _decode_want(body: Reader) -> Want:
+    ranges = []
+    for _ in range(body.number(body.left)):
+        author, first, count = body.take(8), body.number(1 << 40), body.number(1 << 40)
+        ranges.append((author, first, first + count))
+    ids = tuple(body.take(32) for _ in range(body.number(body.left)))
+    proofs = tuple(body.take(8) for _ in range(body.number(body.left)))
+    body.end()
+    return Want(tuple(ranges), ids, proofs)

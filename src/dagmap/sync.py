@@ -1,0 +1,187 @@
+"""Spreading, repair after loss, the late joiner: all three are heads, wants and bounded answers.
+
+Robots announce how far they hold every author's chain. Whoever lacks something asks one robot
+that has it; the answer is cut into chunks and the asker asks on. A newcomer does the same with an
+empty ledger, so robots that never meet converge through those that do.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+from .config import Config
+from .ledger import Ledger
+from .messages import MAX_ECHOES, MAX_MESSAGE, Head, Heads, Message, Transactions, Want
+from .model import AuthorId, TransactionId
+
+MAX_PEERS = 256  # senders are not authenticated here, so their number must be bounded
+_MAX_HEADS = 2500  # of one message
+_MAX_IDS = 256  # of one question
+_ROOM = MAX_MESSAGE - 64  # for transactions in a message
+Post = tuple[Message, AuthorId | None]
+
+
+@dataclass(slots=True)
+class Peer:
+    """Another robot as it was last heard."""
+
+    heads: dict[AuthorId, Head] = field(default_factory=dict)
+    token: int = 0
+    heard: float = 0.0
+    delay: float | None = None  # s, one way, smoothed
+
+
+class Sync:
+    """Keeps this robot's ledger and the others' alike. Time comes in as `now`, seconds."""
+
+    def __init__(self, ledger: Ledger, config: Config, me: AuthorId) -> None:
+        self._ledger, self._config, self._me = ledger, config.sync, me
+        self.peers: OrderedDict[AuthorId, Peer] = OrderedDict()
+        self._next_announcement: float | None = None
+        self._token = 0
+        self._sent_at: OrderedDict[int, float] = OrderedDict()
+        self._asked: dict[AuthorId, tuple[int, float]] = {}  # chain: (end asked for, asked until)
+        self._asked_ids: dict[TransactionId, float] = {}  # id: not to be asked for before
+
+    def tick(self, now: float) -> Iterator[Post]:
+        """Announcements that are due, and questions for what waiting transactions lack."""
+        if self._next_announcement is None or now >= self._next_announcement:
+            self._next_announcement = now + self._config.announce_period
+            yield from self._announce(now)
+        yield from self._ask_for_missing(now)
+
+    def heard(self, sender: AuthorId, message: Heads, now: float) -> Iterator[Post]:
+        """An announcement: remember it, measure the delay, ask for what is lacking here."""
+        if sender == self._me:
+            return
+        peer = self._peer(sender)
+        peer.token, peer.heard = message.token, now
+        for head in message.heads:
+            peer.heads[head.author] = head
+        for whose, token, held in message.echoes:
+            if whose == self._me and token in self._sent_at:
+                delay = max(0.0, now - self._sent_at[token] - held / 1e6) / 2
+                peer.delay = delay if peer.delay is None else 0.75 * peer.delay + 0.25 * delay
+        yield from self._ask(sender, peer, now)
+
+    def answered(self, sender: AuthorId, message: Transactions, now: float) -> Iterator[Post]:
+        """Transactions came (they are in the ledger by now): ask on where the answer was cut."""
+        for author, (end, _) in list(self._asked.items()):
+            if len(self._ledger.chain(author).main) >= end:
+                del self._asked[author]
+        peer = self.peers.get(sender)
+        if message.more and peer is not None:
+            for author in peer.heads:
+                self._asked.pop(author, None)
+            yield from self._ask(sender, peer, now)
+
+    def asked(self, sender: AuthorId, message: Want) -> Iterator[Post]:
+        """Answer a question, up to `chunk_bytes`."""
+        found: list[bytes] = []
+        size, more = 0, False
+        for data in self._found(message):
+            size += len(data)
+            if size > self._config.chunk_bytes:
+                more = True
+                break
+            found.append(data)
+        packed = list(_packed(found))
+        for i, data_ in enumerate(packed):
+            yield Transactions(data_, more and i == len(packed) - 1), sender
+
+    def _found(self, message: Want) -> Iterator[bytes]:
+        for author in message.proofs:
+            for tx in self._ledger.chain(author).proof or ():
+                yield tx.data
+        for id_ in message.ids[:_MAX_IDS]:
+            known = self._ledger.find(id_)
+            if known is not None:
+                yield known.data
+        for author, first, end in message.ranges:
+            for tx in self._ledger.chain(author).main[first:end]:
+                yield tx.data
+
+    def _peer(self, sender: AuthorId) -> Peer:
+        peer = self.peers.setdefault(sender, Peer())
+        self.peers.move_to_end(sender)
+        while len(self.peers) > MAX_PEERS:
+            self.peers.popitem(last=False)
+        return peer
+
+    def _announce(self, now: float) -> Iterator[Post]:
+        heads = [
+            Head(author, chain.end, _tip(chain.main[chain.end - 1].id if chain.end else b""), cut)
+            for author, chain in self._ledger.chains.items()
+            for cut in (chain.cut is not None,)
+            if chain.end or cut
+        ]
+        self._token += 1
+        self._sent_at[self._token] = now
+        while len(self._sent_at) > 64:
+            self._sent_at.popitem(last=False)
+        recent = list(self.peers.items())[-MAX_ECHOES:]
+        echoes = tuple((id_, p.token, round((now - p.heard) * 1e6)) for id_, p in recent)
+        for first in range(0, max(len(heads), 1), _MAX_HEADS):
+            yield Heads(self._token, echoes, tuple(heads[first : first + _MAX_HEADS])), None
+
+    def _ask(self, sender: AuthorId, peer: Peer, now: float) -> Iterator[Post]:
+        ranges, proofs = [], []
+        for head in peer.heads.values():
+            chain = self._ledger.chain(head.author)
+            if head.cut and (chain.cut is None or chain.cut > head.length):
+                proofs.append(head.author)
+            wanted = self._wanted(head)
+            if wanted is not None and now >= self._asked.get(head.author, (0, now))[1]:
+                self._asked[head.author] = (wanted[1], now + self._config.retry_period)
+                ranges.append((head.author, *wanted))
+        if ranges or proofs:
+            yield Want(tuple(ranges[:_MAX_HEADS]), (), tuple(proofs[:_MAX_HEADS])), sender
+
+    def _wanted(self, head: Head) -> tuple[int, int] | None:
+        """The range of an author's chain that a head promises and that is lacking here."""
+        chain = self._ledger.chain(head.author)
+        mine = len(chain.main)
+        if 0 < head.length <= mine:
+            differs = _tip(chain.main[head.length - 1].id) != head.tip
+            counts = chain.cut is None or head.length <= chain.cut
+            return (head.length - 1, head.length) if differs and counts else None
+        end = head.length if chain.cut is None else min(head.length, chain.cut)
+        waiting = self._ledger.waiting_from(head.author)
+        if waiting is not None:
+            end = min(end, waiting)
+        return (mine, end) if end > mine else None
+
+    def _ask_for_missing(self, now: float) -> Iterator[Post]:
+        """By id, one robot after the other, not at once: most are only late."""
+        missing = self._ledger.missing()
+        for id_ in self._asked_ids.keys() - set(missing):
+            del self._asked_ids[id_]
+        due = []
+        for id_ in missing[:_MAX_IDS]:
+            if now >= self._asked_ids.setdefault(id_, now + self._config.retry_period / 4):
+                self._asked_ids[id_] = now + self._config.retry_period
+                due.append(id_)
+        if due and self.peers:
+            whom = next(iter(self.peers))
+            self.peers.move_to_end(whom)
+            yield Want((), tuple(due)), whom
+
+
+def _tip(id_: bytes) -> bytes:
+    return id_[:8].ljust(8, b"\0")
+
+
+def _packed(data: Iterable[bytes]) -> Iterator[tuple[bytes, ...]]:
+    """As many transactions as fit into each message."""
+    batch: list[bytes] = []
+    size = 0
+    for item in data:
+        if batch and size + len(item) + 9 > _ROOM:
+            yield tuple(batch)
+            batch, size = [], 0
+        batch.append(item)
+        size += len(item) + 9
+    if batch:
+        yield tuple(batch)
