@@ -57,12 +57,11 @@ def run(small: int = SMALL, large: int = LARGE, crafted: int = CRAFTED) -> list[
 
 def measure(name: str, points: Points, graph: GraphConfig | None = None, salt: int = SALT) -> Row:
     """Insertion of all points in one call, into an empty graph."""
-    dag = AdjacencyDag(graph or config(), salt)
-    dag.insert(points[:100])  # compiled and warm
-    times = []
+    times, graph = [], graph or config()
+    AdjacencyDag(graph, salt).insert(points[:100])  # compiled and warm
     for _ in range(ROUNDS):
-        dag = AdjacencyDag(graph or config(), salt)
-        times.append(seconds(lambda: dag.insert(points)))
+        dag = AdjacencyDag(graph, salt)
+        times.append(seconds(dag.insert, points))
     row = rated(name, len(points), statistics.median(times))
     row["bytes_per_node"] = dag.nbytes / len(points)
     row["ratio_to_ckdtree"] = row["rate"] * tree_seconds(points) / len(points)
@@ -70,18 +69,26 @@ def measure(name: str, points: Points, graph: GraphConfig | None = None, salt: i
 
 
 def afterwards(points: Points) -> list[Row]:
-    """What else a robot does with its graph: a cycle at a time, issue, withdraw, move N_c."""
+    """What else a robot does with its graph: a cycle at a time, issue, move N_c, withdraw."""
+    parts = np.split(points, range(FRAME, len(points), FRAME))
+    rows = [rated("a cycle of 250 at a time", len(points), seconds(cycles, parts))]
+    rows.append(rated("the same, and issue what is valid", len(points), seconds(cycles, parts, 8)))
     dag = AdjacencyDag(config(), SALT)
-    count = len(points)
-    parts = np.split(points, range(FRAME, count, FRAME))
-    times = {"a cycle of 250 at a time": seconds(lambda: [dag.insert(part) for part in parts])}
-    cores = np.flatnonzero(dag.validity() > 8)[::-1]
-    times["bundles of all valid ones"] = seconds(lambda: dag.take(cores, 2048, count))
-    leaving = np.flatnonzero(~dag.issued())
-    times["N_c from 2 to 3"] = seconds(lambda: setattr(dag, "n_c", 3))
-    rows = [rated(name, count, spent) for name, spent in times.items()]
-    spent = seconds(lambda: dag.withdraw(leaving))
-    return [*rows, rated("withdrawal of what was not issued", len(leaving), spent)]
+    dag.insert(points)
+    rows.append(rated("N_c from 2 to 3", len(points), seconds(setattr, dag, "n_c", 3)))
+    leaving = np.random.default_rng(5).permutation(len(points))[: len(points) // 100]
+    dag.withdraw(leaving[:1])
+    rows.append(rated("one in 100 withdrawn", len(leaving), seconds(dag.withdraw, leaving[1:])))
+    return rows
+
+
+def cycles(parts: list[Points], v_th: int | None = None) -> None:
+    """A robot's day: features come in cycles, and those above V_th go out with their ascendants."""
+    dag = AdjacencyDag(config(), SALT)
+    for part in parts:
+        ids = dag.insert(part)
+        if v_th is not None:
+            dag.take(ids[dag.validity(ids) > v_th][::-1], 2048, 1 << 40)
 
 
 def scattered(count: int, reach: int) -> Points:
@@ -112,9 +119,9 @@ def rated(name: str, count: int, spent: float) -> Row:
     }
 
 
-def seconds(call: Callable[[], object]) -> float:
+def seconds(call: Callable[..., object], *arguments: object) -> float:
     started = time.process_time()
-    call()
+    call(*arguments)
     return time.process_time() - started
 
 
@@ -123,4 +130,4 @@ def tree_seconds(points: Points) -> float:
         build = importlib.import_module("scipy.spatial").cKDTree
     except ImportError:
         return float("nan")
-    return seconds(lambda: build(points))
+    return seconds(build, points)

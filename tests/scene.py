@@ -55,7 +55,8 @@ def cycles(seed: int, count: int = 6, points: int = 40, churn: bool = True) -> I
             if i % 3 == 2:
                 back = pose(0.1 * (i - 2) + 0.03, 0.2 * (i - 2) - 0.5, 0.01)
                 moved = (np.array([float(i - 2)]), back[None])
-        alive += [int(v) for v in ids if int(v) not in alive]
+        if churn:
+            alive += [int(v) for v in ids if int(v) not in alive]
         colors = rng.integers(0, 256, (points, 3)).astype(np.uint8)
         yield Cycle(
             stamp=float(i),

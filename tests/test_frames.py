@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scene import pose
 
 from dagmap.frames import place_frames
 from dagmap.kernels.geometry import apply_pose, compose, invert
 from dagmap.model import FLEET_FRAME, LIMIT_MM, FrameId, pose_matrix, quantise_pose
 from dagmap.payload import Link
+from scene import pose
 
 A, B, C, D = (FrameId(bytes([n]) * 8) for n in (1, 2, 3, 4))
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scene import agent, cycles
 
 from dagmap import State, WorldMap
+from scene import agent, cycles
 
 
 @pytest.fixture(scope="module")

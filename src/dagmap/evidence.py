@@ -1,4 +1,4 @@
-"""Ray evidence: in how many transactions of each author a ray crossed a cell, or a point ended there.
+"""Ray evidence: in how many transactions of an author a ray crossed a cell, or a point ended there.
 
 Sums commute, so this stays outside the fold's undo: what is withdrawn or moved walks again with -1.
 """
@@ -11,8 +11,8 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from .kernels import rays
-from .model import Bools, Int32s, Int64s, Uint8s
+from .kernels import bricks, rays
+from .model import Bools, Int32s, Int64s
 
 D = TypeVar("D", bound=np.generic)
 
@@ -40,7 +40,7 @@ def with_room(column: npt.NDArray[D], rows: int) -> npt.NDArray[D]:
 
 
 def plain(array: npt.NDArray[D]) -> npt.NDArray[D]:
-    """The array itself or a copy that is contiguous and writable: the one form kernels compile for."""
+    """The array, or a contiguous and writable copy: the one form that kernels are compiled for."""
     return array if array.flags.carray else np.array(array, order="C")
 
 
@@ -56,23 +56,23 @@ class RayEvidence:
             raise ValueError(f"cell {cell_mm} mm or ray {max_ray_mm} mm is out of range")
         self._cell, self._limit = cell_mm, max_ray_mm
         self._authors = 0
-        top = np.zeros(rays.KEY + 4, np.int64)
-        top[rays.FREE_BRICK : rays.FREE_WIDE + 1] = -1
-        top[rays.KEY :] = hash_key(salt)
+        key = hash_key(salt)
+        top = np.concatenate([np.zeros(bricks.KEY, np.int64), key])
+        top[bricks.FREE_BRICK : bricks.FREE_WIDE + 1] = -1
         small = np.zeros((0, 64), np.int8)
-        self._bricks = rays.Bricks(
+        self._bricks = bricks.Bricks(
             top=top,
             buckets=np.full(64, -1, np.int32),
-            brick=np.zeros((0, 6), np.int32),
+            brick=np.zeros((0, 5), np.int32),
             entry=np.zeros((0, 18), np.int32),
             small=small,
             word=small.view(np.int32),
             wide=np.zeros((0, 64), np.int32),
         )
-        self._marks = _marks(np.zeros((0, 9), np.int32), np.zeros(0, np.uint8), np.zeros(0, np.int64))
+        self._marks = _marks(64, 1024, np.concatenate([np.zeros(rays.KEY, np.int64), key]))
 
     def __len__(self) -> int:
-        return int(self._bricks.top[rays.LIVE])
+        return int(self._bricks.top[bricks.LIVE])
 
     @property
     def authors(self) -> int:
@@ -108,17 +108,19 @@ class RayEvidence:
             return
         self._authors = max(self._authors, author + 1)
         origins, starts, xyz = plain(origins), plain(starts), plain(xyz)
-        alive, last, done = plain(alive), np.full(len(xyz), -1, np.int64), 0
-        self._bricks.top[[rays.ROWS, rays.CELLS]] = 0
-        while (done := self._mark(origins, starts, xyz, alive, last, done)) < 2 * len(xyz):
-            self._grow_bricks()
-        self._commit(author, sign)
+        alive, last = plain(alive), np.empty(len(xyz), np.int64)
+        cell, limit = self._cell, self._limit
+        while not rays.mark_rays(self._marks, cell, limit, origins, starts, xyz, alive, last):
+            steps = 3 * (limit // cell + 2)  # of the longest ray
+            rows, cells = len(self._marks.row) + steps // 8 + 4, len(self._marks.cell) + steps + 2
+            self._marks = _marks(rows, cells, self._marks.top)
+        self._add(author, sign)
 
     def evidence(self, xyz: Int32s) -> tuple[Int32s, Int32s]:
         """Passes and ends, each (N, A), in the cell of each position (N, 3) mm."""
         shape = (len(xyz), self._authors)
         passes, ends = np.zeros(shape, np.int32), np.zeros(shape, np.int32)
-        rays.read(self._bricks, self._cell, plain(xyz), passes, ends)
+        bricks.read(self._bricks, self._cell, plain(xyz), passes, ends)
         return passes, ends
 
     def judge(
@@ -126,7 +128,7 @@ class RayEvidence:
     ) -> tuple[Int32s, Int32s, Int32s]:
         """Hits, misses and witnesses (N,) of nodes, without arrays of (N, A); see `fold`."""
         hits, misses, witnesses = (np.zeros(len(seed), np.int32) for _ in range(3))
-        rays.judge(
+        bricks.judge(
             self._bricks,
             self._cell,
             say[0],
@@ -140,46 +142,42 @@ class RayEvidence:
         )
         return hits, misses, witnesses
 
-    def _mark(
-        self, origins: Int32s, starts: Int64s, xyz: Int32s, alive: Bools, last: Int64s, begin: int
-    ) -> int:
-        held, marks, cell, limit = self._bricks, self._marks, self._cell, self._limit
-        return rays.mark_all(held, marks, cell, limit, origins, starts, xyz, alive, last, begin)
-
-    def _commit(self, author: int, sign: int) -> None:
-        top, done = self._bricks.top, 0
-        while not rays.find_entries(self._bricks, self._marks, author):
-            entry = with_room(self._bricks.entry, int(top[rays.ENTRIES]) + 1)
-            self._bricks = self._bricks._replace(entry=entry)
-        while (done := rays.add_cells(self._bricks, self._marks, sign, done)) < top[rays.CELLS]:
-            small = with_room(self._bricks.small, 2 * int(top[rays.SMALL]) + 1)
-            wide = with_room(self._bricks.wide, int(top[rays.WIDE]) + 1)
+    def _add(self, author: int, sign: int) -> None:
+        """Add what is marked to the counters of an author."""
+        done, count, top = 0, int(self._marks.top[rays.CELLS]), self._bricks.top
+        while not bricks.find_entries(self._bricks, self._marks, author):
+            self._grow_bricks()
+        while (done := bricks.add_cells(self._bricks, self._marks, sign, done)) < count:
+            small = with_room(self._bricks.small, 2 * int(top[bricks.SMALL]) + 1)
+            wide = with_room(self._bricks.wide, int(top[bricks.WIDE]) + 1)
             word = small.view(np.int32)
             self._bricks = self._bricks._replace(small=small, word=word, wide=wide)
-        if self._marks.row[: top[rays.ROWS], rays.ZERO].any():
-            rays.free_zeros(self._bricks, self._marks)
+        if self._marks.top[rays.ZEROED]:
+            bricks.free_zeros(self._bricks, self._marks)
 
     def _grow_bricks(self) -> None:
-        """Make room for what the longest ray marks."""
-        held, top = self._bricks, self._bricks.top
-        steps = 3 * (self._limit // self._cell + 2)
-        rows = steps // 8 + 4
-        self._marks = _marks(
-            with_room(self._marks.row, int(top[rays.ROWS]) + rows),
-            self._marks.bits,
-            with_room(self._marks.cell, int(top[rays.CELLS]) + steps + 2),
+        """Make room for a brick and an entry for each row of the marks."""
+        held, rows = self._bricks, int(self._marks.top[rays.ROWS])
+        held = held._replace(
+            brick=with_room(held.brick, int(held.top[bricks.BRICKS]) + rows),
+            entry=with_room(held.entry, int(held.top[bricks.ENTRIES]) + rows),
         )
-        held = held._replace(brick=with_room(held.brick, int(top[rays.BRICKS]) + rows))
         if len(held.buckets) < len(held.brick):
             buckets = 1 << (len(held.brick) - 1).bit_length()
             held = held._replace(buckets=np.full(buckets, -1, np.int32))
-            rays.rebuild(held)
+            bricks.rebuild(held)
         self._bricks = held
 
 
-def _marks(row: Int32s, bits: Uint8s, cell: Int64s) -> rays.Marks:
-    """As many bits as the rows need, with those that there are; `word` views their memory."""
-    if len(bits) < 128 * len(row):
-        bits = with_room(bits, 128 * len(row))
-    bits = bits[: len(bits) // 128 * 128]
-    return rays.Marks(row, bits, bits.view(np.int64), cell)
+def _marks(rows: int, cells: int, top: Int64s) -> rays.Marks:
+    """Room for half as many rows and cells again; nothing is marked."""
+    rows, cells = rows + rows // 2, cells + cells // 2
+    bits = np.zeros(128 * rows, np.uint8)
+    return rays.Marks(
+        top=top,
+        table=np.zeros(1 << (2 * rows).bit_length(), np.int32),
+        row=np.zeros((rows, 12), np.int32),
+        bits=bits,
+        word=bits.view(np.int64),
+        cell=np.zeros(cells, np.int64),
+    )

@@ -7,7 +7,6 @@ or on how the authors are numbered.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
@@ -121,7 +120,7 @@ def make_fold(config: FoldConfig, salt: int = 0) -> Fold:
 
 
 class _Features:
-    """The node of each feature number, per author, and the undo records: both end where they end."""
+    """The node of each feature number, per author, and the records for undoing."""
 
     def __init__(self) -> None:
         self._nodes: dict[int, Int32s] = {}
@@ -181,7 +180,7 @@ class DefaultFold:
             buckets=np.full(64, -1, np.int32),
             seed=np.zeros((0, 4), np.int32),
             offset=np.zeros((0, 3), np.int64),
-            count=np.zeros(0, np.int32),
+            observed=np.zeros(0, np.int32),
             color=np.zeros((0, 3), np.int64),
             color_count=np.zeros(0, np.int32),
             first=np.zeros(0, np.int32),
@@ -200,9 +199,7 @@ class DefaultFold:
 
     def undo(self, block: Block) -> None:
         base, features, undo = self._features.last(block)
-        matching.revert(
-            self._nodes, self._shift, block.author, _seen(block), base, features, undo
-        )
+        matching.revert(self._nodes, self._shift, block.author, _seen(block), base, features, undo)
         self._features.close(block)
 
     def feature_nodes(self, author: int) -> Int32s:
@@ -228,7 +225,7 @@ class DefaultFold:
             held = held._replace(
                 seed=with_room(held.seed, nodes),
                 offset=with_room(held.offset, nodes),
-                count=with_room(held.count, nodes),
+                observed=with_room(held.observed, nodes),
                 color=with_room(held.color, nodes),
                 color_count=with_room(held.color_count, nodes),
                 first=with_room(held.first, nodes),
@@ -241,154 +238,108 @@ class DefaultFold:
 
 
 class PaperFold:
-    """Algorithm 2 as printed; see `kernels.algorithm2`. O(N) a bundle; knows no rays."""
+    """Algorithm 2 as printed; see `kernels.algorithm2`. O(N) a bundle.
+
+    It knows neither rays nor sightings. Hits and misses start at 0, so a node is rejected until it
+    was hit more often than missed.
+    """
 
     def __init__(self, config: FoldConfig, salt: int = 0) -> None:
-        self._config, self._features = config, _Features()
-        self._size = self._stamp = 0
-        self._seed = np.zeros((0, 3), np.int32)
-        self._offset = np.zeros((0, 3), np.int64)
-        self._count = np.zeros(0, np.int32)
-        self._color = np.zeros((0, 3), np.int64)
-        self._color_count = np.zeros(0, np.int32)
-        self._parents = np.zeros((0, 0), np.int32)
-        self._votes = np.zeros((0, 2), np.int32)  # hits and misses, from 0
-        self._witnesses = np.zeros(0, np.int32)
-        self._mark = np.zeros(0, np.int32)
-        self._seen_by: dict[tuple[int, int], int] = {}  # observations by (node, author)
-        self._log: list[tuple[int, list[tuple[int, int, int]]]] = []  # size, (node, row, vote)
+        self._config = config  # no hashing here: the salt changes nothing
+        self._features = _Features()
+        self._graph = algorithm2.Graph(
+            sizes=np.zeros(3, np.int64),
+            seed=np.zeros((0, 3), np.int32),
+            offset=np.zeros((0, 3), np.int64),
+            observed=np.zeros(0, np.int32),
+            color=np.zeros((0, 3), np.int64),
+            color_count=np.zeros(0, np.int32),
+            hits=np.zeros(0, np.int32),
+            misses=np.zeros(0, np.int32),
+            witnesses=np.zeros(0, np.int32),
+            first=np.zeros(0, np.int32),
+            entries=np.zeros((0, 3), np.int32),
+            parents=np.zeros((0, 1), np.int32),
+            found=np.zeros(0, np.int32),
+            visited=np.zeros(0, np.int64),
+        )
 
     def __len__(self) -> int:
-        return self._size
+        return int(self._graph.sizes[algorithm2.NODES])
 
     def apply(self, block: Block) -> None:
-        n = len(block.xyz)
-        parents = np.zeros((n, 0), np.int64) if block.parents is None else block.parents
-        self._make_room(n, parents.shape[1])
-        base, features, _ = self._features.open(block)
-        features[base:] = -1
-        log: list[tuple[int, int, int]] = []  # row -1: no observation; vote 0 hit, 1 miss, -1 none
-        self._log.append((self._size, log))
-        taken, out = np.zeros(n, np.bool_), np.empty(max(n, 1), np.int64)
-        for core in block.cores.tolist():
-            end = algorithm2.members(parents, base, core, taken, out)
-            rows = np.concatenate([[core], np.sort(out[1:end])]).astype(np.int64)
-            rows = rows[block.alive[rows]]  # a core that was left out hands on to the oldest
-            if len(rows):
-                self._merge(block, parents, features, base, rows, log)
-        for number in block.sightings.tolist():
-            node = int(features[number]) if number < len(features) else -1
-            if node >= 0:
-                log.append((node, -1, 0))
-                self._votes[node, 0] += 1
+        seen, (order, starts) = _graph_seen(block), _bundles(block)
+        self._make_room(len(block.xyz), seen.parents.shape[1])
+        base, features, losers = self._features.open(block)
+        delta2 = self._config.delta_mm**2
+        algorithm2.apply(
+            self._graph, delta2, block.author, seen, base, order, starts, features, losers
+        )
 
     def undo(self, block: Block) -> None:
-        size, log = self._log.pop()
-        for node, row, vote in reversed(log):
-            if vote >= 0:
-                self._votes[node, vote] -= 1
-            if row >= 0:
-                self._observe(block, node, row, -1)
-        self._size = size
+        order, starts = _bundles(block)
+        base, features, losers = self._features.last(block)
+        algorithm2.revert(
+            self._graph,
+            block.author,
+            _graph_seen(block),
+            base,
+            order,
+            int(starts[-1]),
+            features,
+            losers,
+        )
         self._features.close(block)
 
     def feature_nodes(self, author: int) -> Int32s:
         return self._features.of(author)
 
     def columns(self) -> NodeColumns:
-        n = self._size
-        return NodeColumns(
-            _view(self._seed, n),
-            _view(self._offset, n),
-            _view(self._count, n),
-            _view(self._color, n),
-            _view(self._color_count, n),
-        )
+        return _columns(self._graph, len(self))
+
+    def parents(self) -> Int32s:
+        """(N, P) nodes that each node refers to, -1 none; read-only."""
+        return _view(self._graph.parents, len(self))
 
     def evaluate(self, rays: RayEvidence) -> Verdict:
-        votes, n = self._votes, self._size
-        hits, misses = votes[:n, 0].copy(), votes[:n, 1].copy()
-        return _verdict(hits, misses, self._witnesses[:n].copy(), self._config.witnesses)
+        graph, n = self._graph, len(self)
+        hits, misses, witnesses = graph.hits[:n], graph.misses[:n], graph.witnesses[:n]
+        return _verdict(hits.copy(), misses.copy(), witnesses.copy(), self._config.witnesses)
 
     @property
     def nbytes(self) -> int:
-        columns = (self._seed, self._offset, self._count, self._color, self._color_count)
-        more = (self._parents, self._votes, self._witnesses, self._mark)
-        return self._features.nbytes + sum(array.nbytes for array in (*columns, *more))
+        return self._features.nbytes + sum(array.nbytes for array in self._graph)
 
-    def _merge(
-        self,
-        block: Block,
-        parents: Int64s,
-        features: Int32s,
-        base: int,
-        rows: Int64s,
-        log: list[tuple[int, int, int]],
-    ) -> None:
-        """Alg. 2 for one bundle; nodes are added core first, then its ascendants by number."""
-        self._stamp += 1
-        hit, missed = np.empty(len(rows), np.int64), np.empty(len(rows), np.int64)
-        size, everything = self._size, np.arange(self._size, dtype=np.int64)
-        algorithm2.merge(
-            self._seed,
-            self._parents,
-            everything,
-            size,
-            plain(block.xyz),
-            rows,
-            self._config.delta_mm,
-            self._mark,
-            self._stamp,
-            np.empty(size, np.int64),
-            hit,
-            missed,
+    def _make_room(self, n: int, width: int) -> None:
+        graph = self._graph
+        nodes, entries = int(graph.sizes[0]) + n, int(graph.sizes[1]) + n
+        if width > graph.parents.shape[1]:
+            wider = np.full((len(graph.parents), width), -1, np.int32)
+            wider[:, : graph.parents.shape[1]] = graph.parents
+            graph = graph._replace(parents=wider)
+        rows = dict.fromkeys(graph._fields[1:], nodes) | {"entries": entries}
+        self._graph = graph._replace(
+            **{name: with_room(getattr(graph, name), size) for name, size in rows.items()}
         )
-        for row, twin, loser in zip(rows.tolist(), hit.tolist(), missed.tolist(), strict=True):
-            node = twin if twin >= 0 else self._create(block.xyz[row])
-            features[base + row] = node
-            self._observe(block, node, row, +1)
-            vote = 0 if twin >= 0 else 1 if loser >= 0 else -1
-            log.append((node, row, vote))
-            if loser >= 0:
-                log.append((loser, -1, 1))
-        for node, _, vote in log[len(log) - len(rows) - int((missed >= 0).sum()) :]:
-            if vote >= 0:
-                self._votes[node, vote] += 1
-        added = rows[hit < 0]
-        numbers = parents[added]
-        ends = np.where(numbers >= 0, features[numbers], -1)  # ChangeParent: where each ended
-        self._parents[features[base + added]] = ends
 
-    def _create(self, place: Int32s) -> int:
-        node, self._size = self._size, self._size + 1
-        self._seed[node] = place
-        for column in (self._offset, self._count, self._color, self._color_count, self._votes):
-            column[node] = 0
-        self._witnesses[node] = self._mark[node] = 0
-        self._parents[node] = -1
-        return node
 
-    def _observe(self, block: Block, node: int, row: int, sign: int) -> None:
-        self._offset[node] += sign * (block.xyz[row].astype(np.int64) - self._seed[node])
-        self._count[node] += sign
-        if block.colored[row]:
-            self._color[node] += sign * block.color[row].astype(np.int64)
-            self._color_count[node] += sign
-        before = self._seen_by.get((node, block.author), 0)
-        self._witnesses[node] += int(before == 0) if sign > 0 else -int(before == 1)
-        if before + sign:
-            self._seen_by[node, block.author] = before + sign
-        else:
-            del self._seen_by[node, block.author]
+def _bundles(block: Block) -> tuple[Int64s, Int64s]:
+    order = np.zeros(len(block.xyz), np.int64)
+    starts = np.zeros(len(block.cores) + 1, np.int64)
+    alive, cores = plain(block.alive), plain(block.cores)
+    algorithm2.split(block.base, alive, _parents(block), cores, order, starts)
+    return order, starts
 
-    def _make_room(self, n: int, n_p: int) -> None:
-        rows = self._size + n
-        if self._parents.shape[1] < n_p:
-            self._parents = np.full((len(self._parents), n_p), -1, np.int32)
-        for name in ("seed", "offset", "count", "color", "color_count", "parents", "votes"):
-            setattr(self, f"_{name}", with_room(getattr(self, f"_{name}"), rows))
-        self._witnesses = with_room(self._witnesses, rows)
-        self._mark = with_room(self._mark, rows)
+
+def _parents(block: Block) -> Int64s:
+    none = np.full((len(block.xyz), 1), -1, np.int64)
+    return none if block.parents is None else plain(block.parents)
+
+
+def _graph_seen(block: Block) -> algorithm2.Seen:
+    return algorithm2.Seen(
+        plain(block.xyz), plain(block.color), plain(block.colored), _parents(block)
+    )
 
 
 def _seen(block: Block) -> matching.Seen:
@@ -403,11 +354,11 @@ def _seen(block: Block) -> matching.Seen:
     )
 
 
-def _columns(nodes: matching.Nodes, n: int) -> NodeColumns:
+def _columns(nodes: matching.Nodes | algorithm2.Graph, n: int) -> NodeColumns:
     return NodeColumns(
         _view(nodes.seed[:, :3], n),
         _view(nodes.offset, n),
-        _view(nodes.count, n),
+        _view(nodes.observed, n),
         _view(nodes.color, n),
         _view(nodes.color_count, n),
     )

@@ -19,7 +19,7 @@ from ..model import Int32s, Int64s
 from .inner import inner
 from .jit import kernel
 
-LEAF = 24  # a list of terminals longer than this is split in eight
+LEAF = 6  # a list of terminals longer than this is split in eight
 LAST_LEVEL = -11  # level L > 0: a box of 2^L mm; 0 to -11: one point, ever finer ranges of ids
 ID_SHIFT = 30  # of the coarsest digit (3 bits) of an id
 SCRATCH = 1024  # four numbers for each record that waits in a tree search: 7 a level, 31 levels

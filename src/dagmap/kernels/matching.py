@@ -32,7 +32,7 @@ class Nodes(NamedTuple):
     buckets: Int32s  # (B,) newest node of each bucket or -1; B a power of two, at least 8
     seed: Int32s  # (N, 4) x y z mm, and the next older node of the bucket
     offset: Int64s  # (N, 3) sum over the observations of their offsets from the seed, mm
-    count: Int32s  # (N,) observations
+    observed: Int32s  # (N,) observations
     color: Int64s  # (N, 3) sum of the colours
     color_count: Int32s  # (N,) observations with a colour
     first: Int32s  # (N,) newest entry of the node
@@ -101,7 +101,7 @@ def _create(nodes: Nodes, shift: int, x: int, y: int, z: int) -> int:
     nodes.seed[node, OLDER] = nodes.buckets[bucket]
     nodes.buckets[bucket] = node
     nodes.offset[node, :] = 0
-    nodes.count[node] = 0
+    nodes.observed[node] = 0
     nodes.color[node, :] = 0
     nodes.color_count[node] = 0
     nodes.first[node] = -1
@@ -160,7 +160,7 @@ def _take_back(nodes: Nodes, node: int, author: int, before: int) -> None:
 
 @kernel
 def _accumulate(nodes: Nodes, node: int, seen: Seen, i: int, sign: int) -> None:
-    nodes.count[node] += sign
+    nodes.observed[node] += sign
     for axis in range(3):
         nodes.offset[node, axis] += sign * (int(seen.xyz[i, axis]) - int(nodes.seed[node, axis]))
     if seen.colored[i]:
@@ -228,7 +228,7 @@ def revert(
             continue
         _take_back(nodes, node, author, int(undo[i]))
         _accumulate(nodes, node, seen, i, -1)
-        if nodes.count[node] == 0:
+        if nodes.observed[node] == 0:
             _discard_newest(nodes, shift)
 
 

@@ -1,157 +1,87 @@
 """Section 4.3, preset `default`: which cells a transaction's rays cross, in integers.
 
-Counters stand in bricks of 8^3 cells: per brick and author eight blocks for `pass` and eight for
-`end`, one for each layer of 8 x 8 cells. A block exists exactly as long as one of its counters is
-not zero, an entry (brick, author) as long as it has a block, a brick as long as it has an entry.
-A block is small (bytes) until a counter leaves the range of a byte; then it moves to a wide one.
-
-One call marks cells in bits of its own (`Marks`), lists each cell once, and adds at the end.
+One call marks cells in bits of its own (`Marks`) and lists each cell once; `bricks` then adds what
+is listed to the counters of the map. Rows of the marks are bricks of 8^3 cells.
 
 The walk (Amanatides and Woo, 1987) compares the times of the next crossings t = n/|d| of the three
 axes after multiplication by all three |d|: exact. An axis that climbs enters the next cell when it
 reaches the border, one that falls when it leaves it, hence at equal times climbing axes go first;
-among equals x, then y, then z. Each crossing is a step: a ray through an edge marks one cell beside.
+among equals x, then y, then z. Each crossing is a step: a ray through an edge marks a cell beside.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeAlias
-
-import numpy as np
-import numpy.typing as npt
+from typing import NamedTuple
 
 from ..model import Bools, Int32s, Int64s, Uint8s
 from .jit import kernel
 
-Int8s: TypeAlias = npt.NDArray[np.int8]
-
 # Keyed hash modulo a prime as in `matching` (repeated here: see the trap in `jit`).
 _P = (1 << 31) - 1
 _LOW = 1 << 29
-_NEVER = 1 << 62
-_FREED = -2  # in column FIRST: the brick waits in the list of free ones
-LAYERS = 8
-# Places in Bricks.top: rows ever used and heads of the lists of freed ones, then the key of the hash.
-BRICKS, ENTRIES, SMALL, WIDE, FREE_BRICK, FREE_ENTRY, FREE_SMALL, FREE_WIDE = range(8)
-LIVE, ROWS, CELLS, KEY = range(8, 12)
-OLDER, FIRST, ROW = 3, 4, 5  # columns of Bricks.brick after x y z
-AUTHOR, NEXT, PASS, END = 0, 1, 2, 10  # columns of Bricks.entry; PASS and END: 8 blocks each,
-NONE = -1  # a small one from 0 up, or a wide one from -2 down
-BRICK, ENTRY, ZERO = 6, 7, 8  # columns of Marks.row after the neighbours
-_LEFT = 0x808080 << 40
-_AT = (1 << 40) - 1  # borrows of the three counters (8 bits each) of steps left inside a brick
-
-
-class Bricks(NamedTuple):
-    """The ray evidence of one map."""
-
-    top: Int64s  # (15,) see above
-    buckets: Int32s  # (B,) newest brick of each bucket or -1; B a power of two
-    brick: Int32s  # (N, 6) x y z, next brick of the bucket, newest entry, row in the marks
-    entry: Int32s  # (E, 18) author, next entry of the brick, blocks
-    small: Int8s  # (C, 64) counters of one layer, x fastest
-    word: Int32s  # (C, 16) the same memory; a freed block holds the next free one
-    wide: Int32s  # (W, 64) as `small`
+_NEVER = 1 << 61
+ROWS, CELLS, ZEROED, KEY = 0, 1, 2, 3  # places in Marks.top
+BRICK, SLOT, ENTRY, ZERO = 6, 9, 10, 11  # columns of Marks.row after the neighbours
+# A place on a ray: below, the number of a bit; above, three counters of the steps that are left in
+# the brick along x, y, z, 8 bits each. Below zero a counter borrows, which sets its highest bit.
+_LEFT = 40
+_AT = (1 << _LEFT) - 1
+_BORROWED = 0x808080 << _LEFT
 
 
 class Marks(NamedTuple):
-    """What one call marks: `top[ROWS]` bricks and `top[CELLS]` cells. `word` is `bits`' memory."""
+    """What one call marks."""
 
-    row: Int32s  # (R, 9) rows of the neighbours at -x +x -y +y -z +z or -1; brick, entry, any zero
+    top: Int64s  # (7,) rows in use, cells listed, (`bricks`) any zero?, key of the hash
+    table: Int32s  # (T,) rows by hash of the brick; T a power of two, at least twice R
+    row: Int32s  # (R, 12) rows at -x +x -y +y -z +z or -1; brick x y z; slot; for `bricks`: entry,
+    # whether a counter became zero
     bits: Uint8s  # (R * 128,) bit z * 64 + y * 8 + x of a row: passed; 512 bits on: ended
-    word: Int64s  # (R * 16,)
+    word: Int64s  # (R * 16,) the same memory
     cell: Int64s  # (L,) the cells: number of the bit
 
 
 @kernel
-def _bucket(top: Int64s, mask: int, x: int, y: int, z: int) -> int:
+def _seek(top: Int64s, table: Int32s, row: Int32s, x: int, y: int, z: int) -> int:
+    """Row of a brick, or -1 - (the slot of the table for it). Slots of earlier calls are stale."""
     u = int(top[KEY]) * (x + _LOW)
     v = int(top[KEY + 1]) * (y + _LOW)
     w = int(top[KEY + 2]) * (z + _LOW)
     h = int(top[KEY + 3]) + (u & _P) + (u >> 31) + (v & _P) + (v >> 31) + (w & _P) + (w >> 31)
     h = (h & _P) + (h >> 31)
-    if h >= _P:
-        h -= _P
-    return h & mask
+    slot = int((h if h < _P else h - _P) & (table.shape[0] - 1))
+    while True:
+        r = int(table[slot])
+        if r >= int(top[ROWS]) or row[r, SLOT] != slot:
+            return -1 - slot
+        if row[r, BRICK] == x and row[r, BRICK + 1] == y and row[r, BRICK + 2] == z:
+            return r
+        slot = (slot + 1) & (table.shape[0] - 1)
 
 
 @kernel
-def _find(top: Int64s, buckets: Int32s, brick: Int32s, x: int, y: int, z: int) -> int:
-    b = int(buckets[_bucket(top, buckets.shape[0] - 1, x, y, z)])
-    while b >= 0 and (brick[b, 0] != x or brick[b, 1] != y or brick[b, 2] != z):
-        b = int(brick[b, OLDER])
-    return b
-
-
-@kernel
-def _new_brick(top: Int64s, buckets: Int32s, brick: Int32s, x: int, y: int, z: int) -> int:
-    b = int(top[FREE_BRICK])
-    if b >= 0:
-        top[FREE_BRICK] = brick[b, OLDER]
-    else:
-        b = int(top[BRICKS])
-        top[BRICKS] = b + 1
-    bucket = _bucket(top, buckets.shape[0] - 1, x, y, z)
-    brick[b, 0] = x
-    brick[b, 1] = y
-    brick[b, 2] = z
-    brick[b, OLDER] = buckets[bucket]
-    brick[b, FIRST] = -1
-    brick[b, ROW] = 0
-    buckets[bucket] = b
-    top[LIVE] += 1
-    return b
-
-
-@kernel
-def _free_brick(top: Int64s, buckets: Int32s, brick: Int32s, b: int) -> None:
-    x, y, z = int(brick[b, 0]), int(brick[b, 1]), int(brick[b, 2])
-    bucket = _bucket(top, buckets.shape[0] - 1, x, y, z)
-    at = int(buckets[bucket])
-    if at == b:
-        buckets[bucket] = brick[b, OLDER]
-    else:
-        while brick[at, OLDER] != b:
-            at = int(brick[at, OLDER])
-        brick[at, OLDER] = brick[b, OLDER]
-    brick[b, FIRST] = _FREED
-    brick[b, OLDER] = top[FREE_BRICK]
-    top[FREE_BRICK] = b
-    top[LIVE] -= 1
-
-
-@kernel
-def _enter(
-    top: Int64s,
-    buckets: Int32s,
-    brick: Int32s,
-    row: Int32s,
-    word: Int64s,
-    x: int,
-    y: int,
-    z: int,
+def _new_row(
+    top: Int64s, table: Int32s, row: Int32s, word: Int64s, slot: int, x: int, y: int, z: int
 ) -> int:
-    """Row of a brick in the marks; a brick that is new to the call gets an empty one."""
-    b = _find(top, buckets, brick, x, y, z)
-    if b < 0:
-        return _new_row(top, brick, row, word, _new_brick(top, buckets, brick, x, y, z))
-    r = int(brick[b, ROW])
-    if int(row[r, BRICK]) != b or r >= int(top[ROWS]):  # r is left from an earlier call
-        return _new_row(top, brick, row, word, b)
-    return r
-
-
-@kernel
-def _new_row(top: Int64s, brick: Int32s, row: Int32s, word: Int64s, b: int) -> int:
     r = int(top[ROWS])
     top[ROWS] = r + 1
-    brick[b, ROW] = r
-    row[r, BRICK] = b
+    table[slot] = r
     for side in range(6):
         row[r, side] = -1
+    row[r, BRICK] = x
+    row[r, BRICK + 1] = y
+    row[r, BRICK + 2] = z
+    row[r, SLOT] = slot
     for i in range(r * 16, r * 16 + 16):
         word[i] = 0
     return r
+
+
+@kernel
+def _enter(top: Int64s, table: Int32s, row: Int32s, word: Int64s, x: int, y: int, z: int) -> int:
+    """Row of a brick, an empty one where the call has none yet."""
+    r = _seek(top, table, row, x, y, z)
+    return r if r >= 0 else _new_row(top, table, row, word, -1 - r, x, y, z)
 
 
 @kernel
@@ -189,48 +119,59 @@ def _ray(limit: int, ox: int, oy: int, oz: int, px: int, py: int, pz: int) -> tu
 
 
 @kernel
-def _first_crossing(cell: int, within: int, d: int, scale: int) -> int:
-    """Twice the time of an axis' first crossing, times the product of all |d|; + 1 if falling.
-
-    within: mm from the lower border of the origin's cell.
-    """
+def _first_crossing(cell: int, origin: int, d: int, scale: int) -> int:
+    """Twice the time of an axis' first crossing, times the product of all |d|; + 1 if falling."""
     if d > 0:
-        return 2 * (cell - within) * scale
+        return 2 * (cell - origin % cell) * scale
     if d < 0:
-        return 2 * within * scale + 1
+        return 2 * (origin % cell) * scale + 1
     return _NEVER
 
 
 @kernel
-def _steps_left(c: int, sign: int) -> int:
-    """Steps along one axis until the next but one leaves the brick."""
-    return 7 - (c & 7) if sign > 0 else c & 7
+def _rates(dx: int, dy: int, dz: int) -> tuple[int, int, int]:
+    """Per axis the product of the other two |d| (1 for an axis that stands still)."""
+    x, y, z = max(abs(dx), 1), max(abs(dy), 1), max(abs(dz), 1)
+    return y * z, x * z, x * y
 
 
 @kernel
-def _sign(d: int) -> int:
-    return 1 if d > 0 else -1
+def _stride(d: int, axis: int) -> int:
+    """What one step along an axis adds to the place on the ray."""
+    step = 1 << (3 * axis)
+    return (step if d > 0 else -step) - (1 << (_LEFT + 8 * axis))
 
 
 @kernel
-def _mark(bits: Uint8s, listed: Int64s, count: int, at: int) -> int:
+def _steps_left(c: int, d: int) -> int:
+    """Steps from a cell along one axis that stay in its brick."""
+    return 7 - (c & 7) if d > 0 else c & 7
+
+
+@kernel
+def _bit(cx: int, cy: int, cz: int) -> int:
+    """Number of a cell's bit in its row."""
+    return (cz & 7) << 6 | (cy & 7) << 3 | (cx & 7)
+
+
+@kernel
+def _mark(bits: Uint8s, cells: Int64s, count: int, at: int) -> int:
     """Set a bit and, where it was not set, list it: how many are listed then (one may be spare)."""
     before = int(bits[at >> 3])
     bits[at >> 3] = before | (1 << (at & 7))
-    listed[count] = at
+    cells[count] = at
     return count + 1 - ((before >> (at & 7)) & 1)
 
 
 @kernel
-def _room(top: Int64s, brick: Int32s, row: Int32s, listed: Int64s, rows: int, cells: int) -> bool:
-    """Whether so many rows and cells more are there for certain."""
-    spare = min(brick.shape[0] - int(top[BRICKS]), row.shape[0] - int(top[ROWS])) - rows
-    return min(spare, listed.shape[0] - int(top[CELLS]) - cells - 1) >= 0
+def _has_room(top: Int64s, row: Int32s, cells: Int64s, steps: int) -> bool:
+    """Whether a ray of so many steps finds rows and places in the list for certain."""
+    rows = row.shape[0] - int(top[ROWS]) - (steps // 8 + 4)
+    return bool(min(rows, cells.shape[0] - int(top[CELLS]) - (steps + 2)) >= 0)
 
 
 @kernel
-def _walk_segment(
-    bricks: Bricks,
+def _walk(
     marks: Marks,
     cell: int,
     limit: int,
@@ -240,100 +181,84 @@ def _walk_segment(
     last: Int64s,
     begin: int,
     end: int,
-) -> int:
+) -> bool:
     """Mark the cells from the origin (3,) to the points begin to end - 1, both ends included.
 
-    last (n,) gets the bit that the ray marks last, -1 where the ray was cut.
-    Returns `end`, or the point before whose ray the rows may run out.
+    last (n,) gets the bit that a ray marks last, -1 where the ray was cut. False: too little room.
     """
-    # One function, arrays in locals: to hand tuples on costs more than twenty steps.
-    top, buckets, brick = bricks.top, bricks.buckets, bricks.brick
-    row, bits, word, listed = marks.row, marks.bits, marks.word, marks.cell
+    # One function, arrays in locals: a call that hands arrays on may cost more than twenty steps.
+    top, table, row, bits, word, cells = marks
     ox, oy, oz = int(origin[0]), int(origin[1]), int(origin[2])
     cx, cy, cz = ox // cell, oy // cell, oz // cell
-    home = -1
     for i in range(begin, end):
         if not alive[i]:
             continue
         dx, dy, dz = _ray(limit, ox, oy, oz, int(xyz[i, 0]), int(xyz[i, 1]), int(xyz[i, 2]))
         steps = abs((ox + dx) // cell - cx) + abs((oy + dy) // cell - cy)
         steps += abs((oz + dz) // cell - cz)
-        if not _room(top, brick, row, listed, steps // 8 + 4, steps + 1):
-            return i
-        if home < 0:
-            home = _enter(top, buckets, brick, row, word, cx >> 3, cy >> 3, cz >> 3)
-        ux, uy, uz = max(abs(dx), 1), max(abs(dy), 1), max(abs(dz), 1)
-        ux, uy, uz = uy * uz, ux * uz, ux * uy  # products of the others' |d|
-        tx = _first_crossing(cell, ox - cx * cell, dx, ux)
-        ty = _first_crossing(cell, oy - cy * cell, dy, uy)
-        tz = _first_crossing(cell, oz - cz * cell, dz, uz)
+        if not _has_room(top, row, cells, steps):
+            return False
+        ux, uy, uz = _rates(dx, dy, dz)
+        tx = _first_crossing(cell, ox, dx, ux)
+        ty = _first_crossing(cell, oy, dy, uy) - tx  # after x
+        tz = _first_crossing(cell, oz, dz, uz) - tx
         ux, uy, uz = 2 * cell * ux, 2 * cell * uy, 2 * cell * uz  # between crossings
-        sx, sy, sz = _sign(dx), 8 * _sign(dy), 64 * _sign(dz)
-        left = _steps_left(cx, sx) | _steps_left(cy, sy) << 8 | _steps_left(cz, sz) << 16
+        gx, gy, gz = 1 if dx > 0 else -1, 1 if dy > 0 else -1, 1 if dz > 0 else -1
+        kx, ky, kz = _stride(dx, 0), _stride(dy, 1), _stride(dz, 2)
         bx, by, bz = cx >> 3, cy >> 3, cz >> 3
-        r, at = home, home << 10 | (cz & 7) << 6 | (cy & 7) << 3 | (cx & 7)
-        count = _mark(bits, listed, int(top[CELLS]), at)
-        at += left << 40
-        kx, ky, kz = sx - (1 << 40), sy - (1 << 48), sz - (1 << 56)
-        ty -= tx  # from here on: later than the x axis by
-        tz -= tx
+        r = _enter(top, table, row, word, bx, by, bz)
+        at = r << 10 | _bit(cx, cy, cz)
+        count = _mark(bits, cells, int(top[CELLS]), at)
+        at |= _steps_left(cx, dx) << _LEFT | _steps_left(cy, dy) << (_LEFT + 8)
+        at |= _steps_left(cz, dz) << (_LEFT + 16)
         for _ in range(steps):
-            x = ~((ty | tz) >> 63)
+            x = ~((ty | tz) >> 63)  # -1 where x is next, else 0: nobody can predict a branch here
             y = ((ty - tz - 1) >> 63) & ~x
             z = ~(x | y)
-            at += (x & kx) + (y & ky) + (z & kz)
+            k = (x & kx) + (y & ky) + (z & kz)
+            at += k
             ty += (y & uy) - (x & ux)
             tz += (z & uz) - (x & ux)
-            if at & _LEFT:
-                at -= (x & (8 * sx - (8 << 40))) + (y & (8 * sy - (8 << 48))) + (z & (8 * sz - (8 << 56)))
-                at -= r << 10
-                bx, by, bz = bx + (x & sx), by + (y & (sy >> 3)), bz + (z & (sz >> 6))
-                side = (y & 2) + (z & 4) + int((x & sx) + (y & sy) + (z & sz) > 0)
-                known = int(row[r, side])
-                if known < 0:
-                    known = _enter(top, buckets, brick, row, word, bx, by, bz)
-                    row[r, side] = known
-                    row[known, side ^ 1] = r
-                r = known
+            if at & _BORROWED:
+                at -= 8 * k + (r << 10)  # in at the other side
+                bx, by, bz = bx + (x & gx), by + (y & gy), bz + (z & gz)
+                side = (y & 2) + (z & 4) + (((x & gx) + (y & gy) + (z & gz) + 1) >> 1)
+                beyond = int(row[r, side])
+                if beyond < 0:
+                    beyond = _seek(top, table, row, bx, by, bz)
+                    if beyond < 0:
+                        beyond = _new_row(top, table, row, word, -1 - beyond, bx, by, bz)
+                    row[r, side] = beyond
+                    row[beyond, side ^ 1] = r
+                r = beyond
                 at += r << 10
-            count = _mark(bits, listed, count, at & _AT)
-        at &= _AT
+            count = _mark(bits, cells, count, at & _AT)
         top[CELLS] = count
         whole = ox + dx == xyz[i, 0] and oy + dy == xyz[i, 1] and oz + dz == xyz[i, 2]
-        last[i] = at if whole else -1
-    return end
+        last[i] = at & _AT if whole else -1
+    return True
 
 
 @kernel
-def _mark_ends(
-    bricks: Bricks,
-    marks: Marks,
-    cell: int,
-    xyz: Int32s,
-    alive: Bools,
-    last: Int64s,
-    begin: int,
-) -> int:
-    """Mark the cells in which points end; `last` where it is known."""
-    top, buckets, brick = bricks.top, bricks.buckets, bricks.brick
-    row, bits, word, listed = marks.row, marks.bits, marks.word, marks.cell
-    for i in range(begin, xyz.shape[0]):
+def _mark_ends(marks: Marks, cell: int, xyz: Int32s, alive: Bools, last: Int64s) -> bool:
+    """Mark the cells in which points end; `last` where it is known. False: too little room."""
+    top, table, row, bits, word, cells = marks
+    for i in range(xyz.shape[0]):
         if not alive[i]:
             continue
-        if not _room(top, brick, row, listed, 1, 1):
-            return i
+        if not _has_room(top, row, cells, 0):
+            return False
         at = int(last[i])
         if at < 0:
             cx, cy, cz = int(xyz[i, 0]) // cell, int(xyz[i, 1]) // cell, int(xyz[i, 2]) // cell
-            r = _enter(top, buckets, brick, row, word, cx >> 3, cy >> 3, cz >> 3)
-            at = r << 10 | (cz & 7) << 6 | (cy & 7) << 3 | (cx & 7)
-        top[CELLS] = _mark(bits, listed, int(top[CELLS]), at + 512)
-    return xyz.shape[0]
+            r = _enter(top, table, row, word, cx >> 3, cy >> 3, cz >> 3)
+            at = r << 10 | _bit(cx, cy, cz)
+        top[CELLS] = _mark(bits, cells, int(top[CELLS]), at + 512)
+    return True
 
 
 @kernel
-def mark_all(
-    bricks: Bricks,
+def mark_rays(
     marks: Marks,
     cell: int,
     limit: int,
@@ -342,267 +267,18 @@ def mark_all(
     xyz: Int32s,
     alive: Bools,
     last: Int64s,
-    begin: int,
-) -> int:
-    """Mark what the n rays cross (tasks 0 to n - 1), then where the points end (n to 2n - 1).
+) -> bool:
+    """Mark what the rays of n points cross, and where the points end; what was marked is forgotten.
 
-    `limit` 0 walks no rays. `begin` is the first task to do, `last` (n,) comes in as -1. Returns 2n,
-    or the task before which rows may run out: grow them and call again.
+    origins (s, 3), starts (s + 1,): see `evidence`. `limit` 0 walks no rays. `last` (n,) is room to
+    work in. False: there is too little room; give it more and call again.
     """
-    n = xyz.shape[0]
+    marks.top[ROWS] = 0
+    marks.top[CELLS] = 0
+    last[:] = -1
     if limit > 0:
         for k in range(origins.shape[0]):
-            low, high = max(begin, int(starts[k])), int(starts[k + 1])
-            if low < high:
-                done = _walk_segment(
-                    bricks, marks, cell, limit, origins[k], xyz, alive, last, low, high
-                )
-                if done < high:
-                    return done
-    return n + _mark_ends(bricks, marks, cell, xyz, alive, last, max(0, begin - n))
-
-
-@kernel
-def _find_entry(brick: Int32s, entry: Int32s, b: int, author: int) -> int:
-    e = int(brick[b, FIRST])
-    while e >= 0:
-        if entry[e, AUTHOR] == author:
-            return e
-        e = int(entry[e, NEXT])
-    return -1
-
-
-@kernel
-def _new_entry(top: Int64s, brick: Int32s, entry: Int32s, b: int, author: int) -> int:
-    e = int(top[FREE_ENTRY])
-    if e >= 0:
-        top[FREE_ENTRY] = entry[e, NEXT]
-    else:
-        e = int(top[ENTRIES])
-        top[ENTRIES] = e + 1
-    for column in range(PASS, PASS + 2 * LAYERS):
-        entry[e, column] = NONE
-    entry[e, AUTHOR] = author
-    entry[e, NEXT] = brick[b, FIRST]
-    brick[b, FIRST] = e
-    return e
-
-
-@kernel
-def _drop_entry(top: Int64s, brick: Int32s, entry: Int32s, b: int, e: int) -> None:
-    """Free an entry that has no block left."""
-    if brick[b, FIRST] == e:
-        brick[b, FIRST] = entry[e, NEXT]
-    else:
-        at = int(brick[b, FIRST])
-        while entry[at, NEXT] != e:
-            at = int(entry[at, NEXT])
-        entry[at, NEXT] = entry[e, NEXT]
-    entry[e, NEXT] = top[FREE_ENTRY]
-    top[FREE_ENTRY] = e
-
-
-@kernel
-def _new_block(top: Int64s, block: Int32s, used: int, free: int) -> int:
-    """A zero row of `Bricks.word` or `wide`; used, free: the places in `top` that belong to it."""
-    c = int(top[free])
-    if c >= 0:
-        top[free] = block[c, 0]
-    else:
-        c = int(top[used])
-        top[used] = c + 1
-    for i in range(block.shape[1]):
-        block[c, i] = 0
-    return c
-
-
-@kernel
-def _widen(top: Int64s, small: Int8s, word: Int32s, wide: Int32s, c: int) -> int:
-    """Move a small block to a wide one."""
-    w = _new_block(top, wide, WIDE, FREE_WIDE)
-    for i in range(64):
-        wide[w, i] = small[c, i]
-    word[c, 0] = top[FREE_SMALL]
-    top[FREE_SMALL] = c
-    return w
-
-
-@kernel
-def find_entries(bricks: Bricks, marks: Marks, author: int) -> bool:
-    """Give every row its entry; False where entries run out: grow them and call again."""
-    top, brick, entry, row = bricks.top, bricks.brick, bricks.entry, marks.row
-    for r in range(int(top[ROWS])):
-        if int(top[ENTRIES]) >= entry.shape[0]:
-            return False
-        b = int(row[r, BRICK])
-        e = _find_entry(brick, entry, b, author)
-        row[r, ENTRY] = e if e >= 0 else _new_entry(top, brick, entry, b, author)
-        row[r, ZERO] = 0
-    return True
-
-
-@kernel
-def add_cells(bricks: Bricks, marks: Marks, sign: int, begin: int) -> int:
-    """Add `sign` to what is listed from `begin` on, but where a point ended only to its ends.
-
-    Returns how many cells are listed, or the one before which blocks run out.
-    """
-    top, entry, small, wide = bricks.top, bricks.entry, bricks.small, bricks.wide
-    row, bits, listed = marks.row, marks.bits, marks.cell
-    for i in range(begin, int(top[CELLS])):
-        at = int(listed[i])
-        if at & 512 == 0 and (int(bits[(at >> 3) + 64]) >> (at & 7)) & 1 == 1:
-            continue
-        r = at >> 10
-        e = int(row[r, ENTRY])
-        column = PASS + ((at >> 6) & 15)
-        if int(top[SMALL]) >= small.shape[0] or int(top[WIDE]) >= wide.shape[0]:
-            return i
-        c = int(entry[e, column])
-        if c == NONE:
-            c = _new_block(top, bricks.word, SMALL, FREE_SMALL)
-            entry[e, column] = c
-        counter = sign + (int(small[c, at & 63]) if c >= 0 else int(wide[-2 - c, at & 63]))
-        if c >= 0 and not -128 <= counter <= 127:
-            c = -2 - _widen(top, small, bricks.word, wide, c)
-            entry[e, column] = c
-        if c >= 0:
-            small[c, at & 63] = counter
-        else:
-            wide[-2 - c, at & 63] = counter
-        if counter == 0:
-            row[r, ZERO] = 1
-    return int(top[CELLS])
-
-
-@kernel
-def _is_zero(block: Int32s, c: int) -> bool:
-    rest = 0
-    for i in range(block.shape[1]):
-        rest |= int(block[c, i])
-    return rest == 0
-
-
-@kernel
-def _free_if_zero(top: Int64s, word: Int32s, wide: Int32s, c: int) -> int:
-    """The block as it is, or NONE where it was zero and is free now."""
-    if c >= 0 and _is_zero(word, c):
-        word[c, 0] = top[FREE_SMALL]
-        top[FREE_SMALL] = c
-        return NONE
-    if c < NONE and _is_zero(wide, -2 - c):
-        wide[-2 - c, 0] = top[FREE_WIDE]
-        top[FREE_WIDE] = -2 - c
-        return NONE
-    return c
-
-
-@kernel
-def free_zeros(bricks: Bricks, marks: Marks) -> None:
-    """Free the blocks that have become zero, and the entries and bricks that this leaves empty."""
-    top, brick, entry, row = bricks.top, bricks.brick, bricks.entry, marks.row
-    for r in range(int(top[ROWS])):
-        if row[r, ZERO] == 0:
-            continue
-        b, e = int(row[r, BRICK]), int(row[r, ENTRY])
-        kept = False
-        for column in range(PASS, PASS + 2 * LAYERS):
-            c = _free_if_zero(top, bricks.word, bricks.wide, int(entry[e, column]))
-            entry[e, column] = c
-            kept = kept or c != NONE
-        if not kept:
-            _drop_entry(top, brick, entry, b, e)
-            if brick[b, FIRST] < 0:
-                _free_brick(top, bricks.buckets, brick, b)
-
-
-@kernel
-def rebuild(bricks: Bricks) -> None:
-    """Fill a new, empty array of buckets (all -1)."""
-    top, buckets, brick = bricks.top, bricks.buckets, bricks.brick
-    for b in range(int(top[BRICKS])):
-        if brick[b, FIRST] != _FREED:
-            x, y, z = int(brick[b, 0]), int(brick[b, 1]), int(brick[b, 2])
-            bucket = _bucket(top, buckets.shape[0] - 1, x, y, z)
-            brick[b, OLDER] = buckets[bucket]
-            buckets[bucket] = b
-
-
-@kernel
-def _counter(small: Int8s, wide: Int32s, c: int, at: int) -> int:
-    if c >= 0:
-        return int(small[c, at])
-    return 0 if c == NONE else int(wide[-2 - c, at])
-
-
-@kernel
-def read(bricks: Bricks, cell: int, xyz: Int32s, passes: Int32s, ends: Int32s) -> None:
-    """passes, ends (N, A) of the cells of xyz (N, 3); both come in as zeros."""
-    top, buckets, brick = bricks.top, bricks.buckets, bricks.brick
-    entry, small, wide = bricks.entry, bricks.small, bricks.wide
-    for i in range(xyz.shape[0]):
-        cx, cy, cz = int(xyz[i, 0]) // cell, int(xyz[i, 1]) // cell, int(xyz[i, 2]) // cell
-        b = _find(top, buckets, brick, cx >> 3, cy >> 3, cz >> 3)
-        e = int(brick[b, FIRST]) if b >= 0 else -1
-        at = (cy & 7) << 3 | (cx & 7)
-        while e >= 0:
-            author = int(entry[e, AUTHOR])
-            passes[i, author] = _counter(small, wide, int(entry[e, PASS + (cz & 7)]), at)
-            ends[i, author] = _counter(small, wide, int(entry[e, END + (cz & 7)]), at)
-            e = int(entry[e, NEXT])
-
-
-@kernel
-def _misses(
-    entry: Int32s, small: Int8s, wide: Int32s, e: int, layer: int, at: int, say: int
-) -> int:
-    """Sum over the authors of a brick, from entry e on: min(say, max(0, passes - ends))."""
-    misses = 0
-    while e >= 0:
-        free = _counter(small, wide, int(entry[e, PASS + layer]), at)
-        if free > 0:
-            free -= _counter(small, wide, int(entry[e, END + layer]), at)
-            misses += min(say, max(0, free))
-        e = int(entry[e, NEXT])
-    return misses
-
-
-@kernel
-def judge(
-    bricks: Bricks,
-    cell: int,
-    hit_say: int,
-    miss_say: int,
-    seed: Int32s,
-    first: Int32s,
-    entries: Int32s,
-    hits: Int32s,
-    misses: Int32s,
-    witnesses: Int32s,
-) -> None:
-    """Hits, misses and witnesses of every node, each author's part bounded by its say.
-
-    seed, first, entries: see `matching.Nodes`; the entries' columns are author, hits, cycle, next.
-    """
-    top, buckets, brick = bricks.top, bricks.buckets, bricks.brick
-    entry, small, wide = bricks.entry, bricks.small, bricks.wide
-    bx = by = bz = _NEVER  # the brick of the node before, most often this one's too
-    newest = -1
-    for node in range(seed.shape[0]):
-        cx, cy, cz = int(seed[node, 0]), int(seed[node, 1]), int(seed[node, 2])
-        cx, cy, cz = cx // cell, cy // cell, cz // cell
-        if cx >> 3 != bx or cy >> 3 != by or cz >> 3 != bz:
-            bx, by, bz = cx >> 3, cy >> 3, cz >> 3
-            b = _find(top, buckets, brick, bx, by, bz)
-            newest = int(brick[b, FIRST]) if b >= 0 else -1
-        at = (cy & 7) << 3 | (cx & 7)
-        misses[node] = _misses(entry, small, wide, newest, cz & 7, at, miss_say)
-        h = 0
-        w = 0
-        mine = int(first[node])
-        while mine >= 0:
-            h += min(hit_say, int(entries[mine, 1]))
-            w += 1
-            mine = int(entries[mine, 3])
-        hits[node] = h
-        witnesses[node] = w
+            begin, end = int(starts[k]), int(starts[k + 1])
+            if not _walk(marks, cell, limit, origins[k], xyz, alive, last, begin, end):
+                return False
+    return _mark_ends(marks, cell, xyz, alive, last)

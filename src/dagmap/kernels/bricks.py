@@ -1,0 +1,354 @@
+"""Section 4.3, preset `default`: the counters of the ray evidence, and what they say of a node.
+
+Counters stand in bricks of 8^3 cells: per brick and author eight blocks for `pass` and eight for
+`end`, one for each layer of 8 x 8 cells. A block exists exactly as long as one of its counters is
+not zero, an entry (brick, author) as long as it has a block, a brick as long as it has an entry.
+A block is small (bytes) until a counter leaves the range of a byte; then it moves to a wide one.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from ..model import Int32s, Int64s
+from .jit import kernel
+from .rays import BRICK, CELLS, ENTRY, ROWS, ZERO, ZEROED, Marks
+
+Int8s: TypeAlias = npt.NDArray[np.int8]
+
+# Keyed hash modulo a prime as in `matching` (repeated here: see the trap in `jit`).
+_P = (1 << 31) - 1
+_LOW = 1 << 29
+_NEVER = 1 << 62
+_FREED = -2  # in column FIRST: the brick waits in the list of free ones
+LAYERS = 8
+# Places in Bricks.top: rows ever used, heads of the lists of freed ones, bricks, key of the hash.
+BRICKS, ENTRIES, SMALL, WIDE, FREE_BRICK, FREE_ENTRY, FREE_SMALL, FREE_WIDE, LIVE, KEY = range(10)
+OLDER, FIRST = 3, 4  # columns of Bricks.brick after x y z
+AUTHOR, NEXT, PASS, END = 0, 1, 2, 10  # columns of Bricks.entry; PASS and END: 8 blocks each,
+NONE = -1  # a small one from 0 up, a wide one from -2 down, or none
+
+
+class Bricks(NamedTuple):
+    """The ray evidence of one map."""
+
+    top: Int64s  # (13,) see above
+    buckets: Int32s  # (B,) newest brick of each bucket or -1; B a power of two
+    brick: Int32s  # (N, 5) x y z, next brick of the bucket, newest entry
+    entry: Int32s  # (E, 18) author, next entry of the brick, blocks
+    small: Int8s  # (C, 64) counters of one layer, x fastest
+    word: Int32s  # (C, 16) the same memory; a freed block holds the next free one
+    wide: Int32s  # (W, 64) as `small`
+
+
+@kernel
+def _bucket(top: Int64s, mask: int, x: int, y: int, z: int) -> int:
+    u = int(top[KEY]) * (x + _LOW)
+    v = int(top[KEY + 1]) * (y + _LOW)
+    w = int(top[KEY + 2]) * (z + _LOW)
+    h = int(top[KEY + 3]) + (u & _P) + (u >> 31) + (v & _P) + (v >> 31) + (w & _P) + (w >> 31)
+    h = (h & _P) + (h >> 31)
+    return (h if h < _P else h - _P) & mask
+
+
+@kernel
+def _find(top: Int64s, buckets: Int32s, brick: Int32s, x: int, y: int, z: int) -> int:
+    b = int(buckets[_bucket(top, buckets.shape[0] - 1, x, y, z)])
+    while b >= 0 and (brick[b, 0] != x or brick[b, 1] != y or brick[b, 2] != z):
+        b = int(brick[b, OLDER])
+    return b
+
+
+@kernel
+def _new_brick(top: Int64s, buckets: Int32s, brick: Int32s, x: int, y: int, z: int) -> int:
+    b = int(top[FREE_BRICK])
+    if b >= 0:
+        top[FREE_BRICK] = brick[b, OLDER]
+    else:
+        b = int(top[BRICKS])
+        top[BRICKS] = b + 1
+    bucket = _bucket(top, buckets.shape[0] - 1, x, y, z)
+    brick[b, 0] = x
+    brick[b, 1] = y
+    brick[b, 2] = z
+    brick[b, OLDER] = buckets[bucket]
+    brick[b, FIRST] = -1
+    buckets[bucket] = b
+    top[LIVE] += 1
+    return b
+
+
+@kernel
+def _free_brick(top: Int64s, buckets: Int32s, brick: Int32s, b: int) -> None:
+    x, y, z = int(brick[b, 0]), int(brick[b, 1]), int(brick[b, 2])
+    bucket = _bucket(top, buckets.shape[0] - 1, x, y, z)
+    at = int(buckets[bucket])
+    if at == b:
+        buckets[bucket] = brick[b, OLDER]
+    else:
+        while brick[at, OLDER] != b:
+            at = int(brick[at, OLDER])
+        brick[at, OLDER] = brick[b, OLDER]
+    brick[b, FIRST] = _FREED
+    brick[b, OLDER] = top[FREE_BRICK]
+    top[FREE_BRICK] = b
+    top[LIVE] -= 1
+
+
+@kernel
+def _find_entry(brick: Int32s, entry: Int32s, b: int, author: int) -> int:
+    e = int(brick[b, FIRST])
+    while e >= 0:
+        if entry[e, AUTHOR] == author:
+            return e
+        e = int(entry[e, NEXT])
+    return -1
+
+
+@kernel
+def _new_entry(top: Int64s, brick: Int32s, entry: Int32s, b: int, author: int) -> int:
+    e = int(top[FREE_ENTRY])
+    if e >= 0:
+        top[FREE_ENTRY] = entry[e, NEXT]
+    else:
+        e = int(top[ENTRIES])
+        top[ENTRIES] = e + 1
+    for column in range(PASS, PASS + 2 * LAYERS):
+        entry[e, column] = NONE
+    entry[e, AUTHOR] = author
+    entry[e, NEXT] = brick[b, FIRST]
+    brick[b, FIRST] = e
+    return e
+
+
+@kernel
+def _drop_entry(top: Int64s, brick: Int32s, entry: Int32s, b: int, e: int) -> None:
+    if brick[b, FIRST] == e:
+        brick[b, FIRST] = entry[e, NEXT]
+    else:
+        at = int(brick[b, FIRST])
+        while entry[at, NEXT] != e:
+            at = int(entry[at, NEXT])
+        entry[at, NEXT] = entry[e, NEXT]
+    entry[e, NEXT] = top[FREE_ENTRY]
+    top[FREE_ENTRY] = e
+
+
+@kernel
+def _new_block(top: Int64s, block: Int32s, used: int, free: int) -> int:
+    """A zero row of `Bricks.word` or `wide`; used, free: the places in `top` that belong to it."""
+    c = int(top[free])
+    if c >= 0:
+        top[free] = block[c, 0]
+    else:
+        c = int(top[used])
+        top[used] = c + 1
+    for i in range(block.shape[1]):
+        block[c, i] = 0
+    return c
+
+
+@kernel
+def _widen(top: Int64s, small: Int8s, word: Int32s, wide: Int32s, c: int) -> int:
+    """Move a small block to a wide one."""
+    w = _new_block(top, wide, WIDE, FREE_WIDE)
+    for i in range(64):
+        wide[w, i] = small[c, i]
+    word[c, 0] = top[FREE_SMALL]
+    top[FREE_SMALL] = c
+    return w
+
+
+@kernel
+def find_entries(bricks: Bricks, marks: Marks, author: int) -> bool:
+    """Give every row of the marks its entry; False where there is too little room."""
+    top, buckets, brick, entry = bricks.top, bricks.buckets, bricks.brick, bricks.entry
+    row = marks.row
+    rows = int(marks.top[ROWS])
+    if min(brick.shape[0] - int(top[BRICKS]), entry.shape[0] - int(top[ENTRIES])) < rows:
+        return False
+    for r in range(rows):
+        x, y, z = int(row[r, BRICK]), int(row[r, BRICK + 1]), int(row[r, BRICK + 2])
+        b = _find(top, buckets, brick, x, y, z)
+        if b < 0:
+            b = _new_brick(top, buckets, brick, x, y, z)
+        e = _find_entry(brick, entry, b, author)
+        row[r, ENTRY] = e if e >= 0 else _new_entry(top, brick, entry, b, author)
+        row[r, ZERO] = 0
+    marks.top[ZEROED] = 0
+    return True
+
+
+@kernel
+def add_cells(bricks: Bricks, marks: Marks, sign: int, begin: int) -> int:
+    """Add `sign` to what is listed from `begin` on, but where a point ended only to its ends.
+
+    Returns how many cells are listed, or the one before which blocks may run out.
+    """
+    top, entry = bricks.top, bricks.entry
+    small, word, wide = bricks.small, bricks.word, bricks.wide
+    row, bits, cells = marks.row, marks.bits, marks.cell
+    count = int(marks.top[CELLS])
+    for i in range(begin, count):
+        at = int(cells[i])
+        if at & 512 == 0 and (int(bits[(at >> 3) + 64]) >> (at & 7)) & 1 == 1:
+            continue
+        r = at >> 10
+        e = int(row[r, ENTRY])
+        column = PASS + ((at >> 6) & 15)
+        if int(top[SMALL]) >= small.shape[0] or int(top[WIDE]) >= wide.shape[0]:
+            return i
+        c = int(entry[e, column])
+        if c == NONE:
+            c = _new_block(top, word, SMALL, FREE_SMALL)
+            entry[e, column] = c
+        counter = sign + (int(small[c, at & 63]) if c >= 0 else int(wide[-2 - c, at & 63]))
+        if c >= 0 and not -128 <= counter <= 127:
+            c = -2 - _widen(top, small, word, wide, c)
+            entry[e, column] = c
+        if c >= 0:
+            small[c, at & 63] = counter
+        else:
+            wide[-2 - c, at & 63] = counter
+        if counter == 0:
+            row[r, ZERO] = 1
+            marks.top[ZEROED] = 1
+    return count
+
+
+@kernel
+def _is_zero(block: Int32s, c: int) -> bool:
+    rest = 0
+    for i in range(block.shape[1]):
+        rest |= int(block[c, i])
+    return rest == 0
+
+
+@kernel
+def _free_if_zero(top: Int64s, word: Int32s, wide: Int32s, c: int) -> int:
+    """The block as it is, or NONE where it was zero and is free now."""
+    if c >= 0 and _is_zero(word, c):
+        word[c, 0] = top[FREE_SMALL]
+        top[FREE_SMALL] = c
+        return NONE
+    if c < NONE and _is_zero(wide, -2 - c):
+        wide[-2 - c, 0] = top[FREE_WIDE]
+        top[FREE_WIDE] = -2 - c
+        return NONE
+    return c
+
+
+@kernel
+def free_zeros(bricks: Bricks, marks: Marks) -> None:
+    """Free the blocks that have become zero, and the entries and bricks that this leaves empty."""
+    top, brick, entry, row = bricks.top, bricks.brick, bricks.entry, marks.row
+    for r in range(int(marks.top[ROWS])):
+        if row[r, ZERO] == 0:
+            continue
+        e = int(row[r, ENTRY])
+        kept = False
+        for column in range(PASS, PASS + 2 * LAYERS):
+            c = _free_if_zero(top, bricks.word, bricks.wide, int(entry[e, column]))
+            entry[e, column] = c
+            kept = kept or c != NONE
+        if not kept:
+            x, y, z = int(row[r, BRICK]), int(row[r, BRICK + 1]), int(row[r, BRICK + 2])
+            b = _find(top, bricks.buckets, brick, x, y, z)
+            _drop_entry(top, brick, entry, b, e)
+            if brick[b, FIRST] < 0:
+                _free_brick(top, bricks.buckets, brick, b)
+
+
+@kernel
+def rebuild(bricks: Bricks) -> None:
+    """Fill a new, empty array of buckets (all -1)."""
+    top, buckets, brick = bricks.top, bricks.buckets, bricks.brick
+    for b in range(int(top[BRICKS])):
+        if brick[b, FIRST] != _FREED:
+            x, y, z = int(brick[b, 0]), int(brick[b, 1]), int(brick[b, 2])
+            bucket = _bucket(top, buckets.shape[0] - 1, x, y, z)
+            brick[b, OLDER] = buckets[bucket]
+            buckets[bucket] = b
+
+
+@kernel
+def _counter(small: Int8s, wide: Int32s, c: int, at: int) -> int:
+    if c >= 0:
+        return int(small[c, at])
+    return 0 if c == NONE else int(wide[-2 - c, at])
+
+
+@kernel
+def read(bricks: Bricks, cell: int, xyz: Int32s, passes: Int32s, ends: Int32s) -> None:
+    """passes, ends (N, A) of the cells of xyz (N, 3); both come in as zeros."""
+    top, buckets, brick = bricks.top, bricks.buckets, bricks.brick
+    entry, small, wide = bricks.entry, bricks.small, bricks.wide
+    for i in range(xyz.shape[0]):
+        cx, cy, cz = int(xyz[i, 0]) // cell, int(xyz[i, 1]) // cell, int(xyz[i, 2]) // cell
+        b = _find(top, buckets, brick, cx >> 3, cy >> 3, cz >> 3)
+        e = int(brick[b, FIRST]) if b >= 0 else -1
+        at = (cy & 7) << 3 | (cx & 7)
+        while e >= 0:
+            author = int(entry[e, AUTHOR])
+            passes[i, author] = _counter(small, wide, int(entry[e, PASS + (cz & 7)]), at)
+            ends[i, author] = _counter(small, wide, int(entry[e, END + (cz & 7)]), at)
+            e = int(entry[e, NEXT])
+
+
+@kernel
+def _misses(
+    entry: Int32s, small: Int8s, wide: Int32s, e: int, layer: int, at: int, say: int
+) -> int:
+    """Sum over the authors of a brick, from entry e on: min(say, max(0, passes - ends))."""
+    misses = 0
+    while e >= 0:
+        free = _counter(small, wide, int(entry[e, PASS + layer]), at)
+        if free > 0:
+            free -= _counter(small, wide, int(entry[e, END + layer]), at)
+            misses += min(say, max(0, free))
+        e = int(entry[e, NEXT])
+    return misses
+
+
+@kernel
+def judge(
+    bricks: Bricks,
+    cell: int,
+    hit_say: int,
+    miss_say: int,
+    seed: Int32s,
+    first: Int32s,
+    entries: Int32s,
+    hits: Int32s,
+    misses: Int32s,
+    witnesses: Int32s,
+) -> None:
+    """Hits, misses and witnesses of every node, each author's part bounded by its say.
+
+    seed, first, entries: see `matching.Nodes`; the entries' columns are author, hits, cycle, next.
+    """
+    top, buckets, brick = bricks.top, bricks.buckets, bricks.brick
+    entry, small, wide = bricks.entry, bricks.small, bricks.wide
+    bx = by = bz = _NEVER  # the brick of the node before, most often this one's too
+    newest = -1
+    for node in range(seed.shape[0]):
+        cx, cy, cz = int(seed[node, 0]), int(seed[node, 1]), int(seed[node, 2])
+        cx, cy, cz = cx // cell, cy // cell, cz // cell
+        if cx >> 3 != bx or cy >> 3 != by or cz >> 3 != bz:
+            bx, by, bz = cx >> 3, cy >> 3, cz >> 3
+            b = _find(top, buckets, brick, bx, by, bz)
+            newest = int(brick[b, FIRST]) if b >= 0 else -1
+        at = (cy & 7) << 3 | (cx & 7)
+        misses[node] = _misses(entry, small, wide, newest, cz & 7, at, miss_say)
+        h = 0
+        w = 0
+        mine = int(first[node])
+        while mine >= 0:
+            h += min(hit_say, int(entries[mine, 1]))
+            w += 1
+            mine = int(entries[mine, 3])
+        hits[node] = h
+        witnesses[node] = w
