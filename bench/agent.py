@@ -8,12 +8,12 @@ import time
 from typing import Any
 
 import numpy as np
-from scenes import surface
 
 from dagmap import Agent, Config, Cycle, GraphConfig, Identity
 from dagmap.consensus import Consensus
 from dagmap.ledger import Ledger
 from dagmap.transaction import parse, seal
+from scenes import surface
 
 CYCLE = 1000  # features a cycle
 CONFIG = Config(graph=GraphConfig(reference_pitch=0.25, max_parent_distance=0.75))

@@ -7,16 +7,13 @@ runs; every rate stands beside a cKDTree of the same points built in the same ru
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from dagmap.config import FoldConfig
-from dagmap.fold import Block, DefaultFold, RayEvidence
+from dagmap.fold import Block
 from dagmap.model import Int32s
 
 POINTS = 250  # of a block

@@ -61,7 +61,7 @@ class Agent:
         """An agent that holds these transactions (as `Accepted` gave them) and goes on."""
         agent = cls(identity, config)
         for data in transactions:
-            agent._through_the_door(data)
+            agent._through_the_door(data, again=True)
         agent.observing.resume(agent.ledger.chain(identity.author).main)
         agent._outbox.clear()
         return agent
@@ -169,7 +169,7 @@ class Agent:
             self._post([(Transactions((data,)), None)])
         return events
 
-    def _through_the_door(self, data: bytes) -> list[Event]:
+    def _through_the_door(self, data: bytes, again: bool = False) -> list[Event]:
         """The one door: own and foreign transactions alike are judged, kept and folded."""
         if self.ledger.holds(id_of(data)):
             return []
@@ -177,7 +177,7 @@ class Agent:
             transaction = parse(data, self.config)
         except Refusal as refusal:
             return [Rejected(refusal.reason, refusal.fault, refusal.detail)]
-        outcome = self.ledger.add(transaction)
+        outcome = self.ledger.add(transaction, again)
         events: list[Event] = []
         for author, sequence in outcome.forked:
             self.consensus.cut(author, sequence)

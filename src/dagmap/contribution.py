@@ -44,6 +44,7 @@ class Author:
         if len(numbers) == 0:
             return []
         self.retracted = grown(self.retracted, int(numbers[-1]) + 1, False)
+        numbers = numbers[~self.retracted[numbers]]
         self.retracted[numbers] = True
         hit = np.searchsorted(np.array(self.bases, np.int64), numbers, side="right") - 1
         return [self.keys[i] for i in np.unique(hit).tolist()]
@@ -121,7 +122,8 @@ class Contribution:
         for s, cycle in enumerate(self.cycles.tolist()):
             rows = slice(int(self.starts[s]), int(self.starts[s + 1]))
             home = self._home(cycle, frames)
-            if home is None:
+            known = next((h for h in homes if h is not None), None)
+            if home is None or (known is not None and home[1][0] != known):
                 alive[rows] = False
                 homes.append(None)
                 continue
@@ -173,7 +175,8 @@ class Contribution:
             home = self._home(sighting.cycle, frames)
             if home is not None:
                 again.setdefault(home[1][0], []).append(sighting)
-        components = sorted({*again, *(home for home in homes if home is not None)})
+        # Honest transactions lie in one SLAM frame; a map for every feature would be a bomb.
+        components = [*(home for home in homes if home is not None), *again][:1]
         parts = []
         for component in components:
             mine = np.repeat(np.array([h == component for h in homes], np.bool_), self._sizes())

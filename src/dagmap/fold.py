@@ -327,7 +327,8 @@ def _bundles(block: Block) -> tuple[Int64s, Int64s]:
     order = np.zeros(len(block.xyz), np.int64)
     starts = np.zeros(len(block.cores) + 1, np.int64)
     alive, cores = plain(block.alive), plain(block.cores)
-    algorithm2.split(block.base, alive, _parents(block), cores, order, starts)
+    room = order.copy(), starts.copy()
+    algorithm2.split(block.base, alive, _parents(block), cores, order, starts, *room)
     return order, starts
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from .kernels.geometry import compose, invert
-from .model import FrameId, Int32s
+from .model import FLEET_FRAME, FrameId, Int32s
 from .payload import Link
 
 IDENTITY_POSE = (1 << 30, 0, 0, 0, 0, 0, 0)
@@ -39,8 +39,9 @@ def _spanning_tree(links: Iterable[Link]) -> list[Link]:
             frame = above
         return frame
 
-    def merit(link: Link) -> tuple[int, FrameId, FrameId, bytes]:
-        return (-link.inliers, link.source, link.target, link.pose.tobytes())
+    def merit(link: Link) -> tuple[bool, int, FrameId, FrameId, bytes]:
+        configured = link.target == FLEET_FRAME  # a robot's word on its own start comes first
+        return (not configured, -link.inliers, link.source, link.target, link.pose.tobytes())
 
     tree = []
     for link in sorted(links, key=merit):

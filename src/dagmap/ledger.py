@@ -60,6 +60,7 @@ class Ledger:
         self._waiting_at: dict[tuple[AuthorId, int], TransactionId] = {}
         self._waiting_size = 0
         self._tips: set[TransactionId] = set()
+        self._overfull: set[TransactionId] = set()  # kept, but never folded
 
     def __len__(self) -> int:
         return len(self._known)
@@ -89,7 +90,7 @@ class Ledger:
     def counts(self, tx: Transaction) -> bool:
         """Whether an accepted transaction lies before its author's cut, if there is one."""
         cut = self.chain(tx.author).cut
-        return cut is None or tx.sequence < cut
+        return (cut is None or tx.sequence < cut) and tx.id not in self._overfull
 
     def features(self, author: AuthorId) -> int:
         """How many features the author's chain has issued."""
@@ -116,11 +117,14 @@ class Ledger:
                 lacking.extend(id_ for id_ in before if not self.holds(id_))
         return tuple(dict.fromkeys(lacking))
 
-    def waiting_from(self, author: AuthorId) -> int | None:
-        """The lowest sequence number of an author that waits, or None."""
-        return min((n for who, n in self._waiting_at if who == author), default=None)
+    def waiting_from(self) -> dict[AuthorId, int]:
+        """The lowest sequence number that waits, by author."""
+        lowest: dict[AuthorId, int] = {}
+        for author, number in self._waiting_at:
+            lowest[author] = min(number, lowest.get(author, number))
+        return lowest
 
-    def add(self, transaction: Transaction) -> Outcome:
+    def add(self, transaction: Transaction, again: bool = False) -> Outcome:
         """Take a transaction that is valid in itself, and whatever waited for it."""
         outcome = Outcome()
         queue = [transaction]
@@ -129,7 +133,7 @@ class Ledger:
             if self.holds(tx.id):
                 continue
             self._note_fork(tx, outcome)
-            refusal = self._admit(tx, outcome, first=tx is transaction)
+            refusal = self._admit(tx, outcome, first=tx is transaction, again=again)
             if refusal is not None:
                 outcome.refused.append(refusal)
             elif tx.id in self._known:
@@ -137,15 +141,16 @@ class Ledger:
                 queue.extend(self._released_by(tx.id))
         return outcome
 
-    def _admit(self, tx: Transaction, outcome: Outcome, first: bool) -> Refusal | None:
+    def _admit(self, tx: Transaction, outcome: Outcome, first: bool, again: bool) -> Refusal | None:
         """Accept, keep waiting, or refuse. Beyond a cut only what others refer to is accepted."""
         chain = self.chain(tx.author)
-        if chain.cut is not None and tx.sequence >= chain.cut and tx.id not in self._waited_for:
+        beyond = chain.cut is not None and tx.sequence >= chain.cut
+        if beyond and not again and tx.id not in self._waited_for:
             proof = chain.proof or ()
             if any(tx.id == kept.id for kept in proof):
                 return None
             return Refusal(Reason.FORK, f"sequence {tx.sequence}, cut {chain.cut}", tx.author)
-        missing = tuple(id_ for id_ in tx.refers_to if id_ not in self._known)
+        missing = tuple(dict.fromkeys(id_ for id_ in tx.refers_to if id_ not in self._known))
         if missing:
             self._wait(tx, missing)
             if first:
@@ -177,20 +182,6 @@ class Ledger:
         seen = (int(s.numbers[-1]) for s in payload.sightings if len(s.numbers))
         if max(seen, default=-1) >= before + tx.features:
             return Refusal(Reason.CHAIN, "sees again what was never issued", tx.author)
-        return self._judge_children(tx)
-
-    def _judge_children(self, tx: Transaction) -> Refusal | None:
-        """No issued feature ever has more than n_c_max children (section 4.1).
-
-        Only on the main chain: another branch lies beyond the cut and is never folded.
-        """
-        bundle, chain = tx.payload.bundle, self.chain(tx.author)
-        if bundle is None or not self._continues(chain, tx):
-            return None
-        older = bundle.parents[(bundle.parents >= 0) & (bundle.parents < bundle.base)]
-        numbers, counts = np.unique(older, return_counts=True)
-        if (chain.children[numbers] + counts > self._config.graph.n_c_max).any():
-            return Refusal(Reason.STRUCTURE, "an issued feature has too many children", tx.author)
         return None
 
     def _accept(self, tx: Transaction) -> None:
@@ -202,24 +193,29 @@ class Ledger:
         self._tips.add(tx.id)
         if self._continues(chain, tx):
             chain.main.append(tx)
-            self._count_children(chain, tx)
+            if not self._count_children(chain, tx):
+                self._overfull.add(tx.id)
 
     @staticmethod
     def _continues(chain: Chain, tx: Transaction) -> bool:
         """Whether it is the next one of the main chain, not of another branch."""
         return tx.previous == (chain.main[-1].id if chain.main else None)
 
-    def _count_children(self, chain: Chain, tx: Transaction) -> None:
+    def _count_children(self, chain: Chain, tx: Transaction) -> bool:
         bundle = tx.payload.bundle
         if bundle is None:
-            return
+            return True
         end = bundle.base + len(bundle.position)
         if end > len(chain.children):
             grown = np.zeros(max(end, 2 * len(chain.children)), np.uint8)
             grown[: len(chain.children)] = chain.children
             chain.children = grown
         numbers, counts = np.unique(bundle.parents[bundle.parents >= 0], return_counts=True)
-        chain.children[numbers] += counts.astype(np.uint8)
+        total = chain.children[numbers] + counts
+        if (total > self._config.graph.n_c_max).any():
+            return False
+        chain.children[numbers] = total
+        return True
 
     def _note_fork(self, tx: Transaction, outcome: Outcome) -> None:
         """Two self-valid transactions with one number are the proof, whatever else is known."""

@@ -49,7 +49,7 @@ class Head:
     author: AuthorId
     length: int  # transactions of the chain that count
     tip: bytes  # first 8 bytes of the id of the last one, zeros where there is none
-    cut: bool = False
+    cut: int | None = None  # from where nothing counts: the sender holds the proof
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +128,8 @@ def _encode_heads(message: Heads) -> bytes:
     for author, token, held in message.echoes:
         out.append(author + wire.number(token) + wire.number(held))
     for head in message.heads:
-        out.append(head.author + wire.number(2 * head.length + head.cut) + head.tip)
+        cut = b"" if head.cut is None else wire.number(head.cut)
+        out.append(head.author + wire.number(2 * head.length + bool(cut)) + head.tip + cut)
     return b"".join(out)
 
 
@@ -157,7 +158,8 @@ def _decode_heads(body: Reader) -> Heads:
     heads = []
     while body.left:
         author, packed = body.take(8), body.number(1 << 41)
-        heads.append(Head(author, packed >> 1, body.take(8), bool(packed & 1)))
+        tip = body.take(8)
+        heads.append(Head(author, packed >> 1, tip, body.number(1 << 40) if packed & 1 else None))
     return Heads(token, tuple(echoes), tuple(heads))
 
 

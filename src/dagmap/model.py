@@ -124,7 +124,9 @@ def quantise_cycle(cycle: Cycle) -> QuantisedCycle:
     removed = _ids(() if cycle.removed is None else cycle.removed, f"{where}: removed")
     if len(np.unique(removed)) != len(removed):
         raise CycleError(f"{where}: removed names an id twice; name each withdrawn id once")
-    if isinstance(cycle.session, bool) or not 0 <= int(cycle.session) < 1 << 32:
+    session = cycle.session
+    whole = isinstance(session, (int, np.integer)) and not isinstance(session, bool)
+    if not whole or not 0 <= session < 1 << 32:
         raise CycleError(f"{where}: session {cycle.session!r} is not a number from 0 to 2^32 - 1")
     colors = None if cycle.colors is None else _colors(cycle.colors, len(points), where)
     return QuantisedCycle(
@@ -216,7 +218,7 @@ def _quaternion(rotation: Floats) -> Floats:
 
 
 def _ids(ids: npt.ArrayLike | Sequence[int], where: str) -> npt.NDArray[np.uint64]:
-    array = np.asarray(ids)
+    array = _array(ids, where)
     if array.size == 0:
         return np.zeros(0, np.uint64)
     if array.ndim != 1 or array.dtype.kind not in "iu" or int(array.min()) < 0:
@@ -224,8 +226,15 @@ def _ids(ids: npt.ArrayLike | Sequence[int], where: str) -> npt.NDArray[np.uint6
     return array.astype(np.uint64)
 
 
+def _array(values: npt.ArrayLike, where: str) -> npt.NDArray[np.generic]:
+    try:
+        return np.asarray(values)
+    except (TypeError, ValueError) as error:
+        raise CycleError(f"{where}: not an array ({error})") from None
+
+
 def _colors(colors: npt.ArrayLike, count: int, where: str) -> Uint8s:
-    array = np.asarray(colors)
+    array = _array(colors, f"{where}: colors")
     if array.size == 0 and count == 0:
         return np.zeros((0, 3), np.uint8)
     if array.shape != (count, 3) or array.dtype != np.uint8:
@@ -240,16 +249,23 @@ def _moved(
 ) -> tuple[tuple[int, Int32s], ...]:
     if moved is None:
         return ()
-    stamps, poses = np.asarray(moved[0], np.float64), np.asarray(moved[1], np.float64)
+    try:
+        given_stamps, given_poses = moved
+        stamps, poses = np.asarray(given_stamps, np.float64), np.asarray(given_poses, np.float64)
+    except (TypeError, ValueError) as error:
+        raise CycleError(f"{where}: moved is not (stamps, poses) of numbers ({error})") from None
     if stamps.ndim != 1 or poses.shape != (len(stamps), 4, 4):
         raise CycleError(
             f"{where}: moved is {stamps.shape} stamps with {poses.shape} poses; "
             "(M,) and (M, 4, 4) are wanted"
         )
-    return tuple(
+    out = tuple(
         (quantise_stamp(stamp), quantise_pose(pose, f"{where}: moved[{i}]"))
         for i, (stamp, pose) in enumerate(zip(stamps.tolist(), poses, strict=True))
     )
+    if len({stamp for stamp, _ in out}) < len(out):
+        raise CycleError(f"{where}: moved names a cycle twice; give its newest pose once")
+    return out
 
 
 class Reason(Enum):

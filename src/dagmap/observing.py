@@ -49,6 +49,7 @@ class Observing:
         self._retracted: list[Int64s] = []
         self._links: list[Link] = []
         self._introduced = False
+        self._earlier: list[Issuance] = []  # of former sessions, with features held back
         self._start_frame()
 
     def _start_frame(self) -> None:
@@ -66,7 +67,10 @@ class Observing:
                 self.cycles = max(self.cycles, anchor.cycle + 1)
                 last = self._sessions.get(anchor.session, anchor.stamp)
                 self._sessions[anchor.session] = max(last, anchor.stamp)
+                if anchor.session != self.session:
+                    self._cycle_of = {}
                 self.session = anchor.session
+                self._cycle_of[anchor.stamp] = anchor.cycle
 
     def check(self, cycle: QuantisedCycle) -> QuantisedCycle:
         """What only this robot's history can tell. Raises CycleError; changes nothing."""
@@ -105,10 +109,11 @@ class Observing:
         if len(cycle.removed):
             ids = cycle.removed.tolist()
             nodes = np.sort(np.array([self._nodes.pop(id_) for id_ in ids], np.int64))
+            nodes = nodes[nodes >= 0]  # others were thrown out of range by a move
             numbers = self.issuance.number[nodes]
             self._retracted.append(numbers[numbers >= 0])
             self.issuance.revalue(self.graph.withdraw(nodes))
-        names = {node: id_ for id_, node in self._nodes.items()} if cycle.moved else {}
+        names = {node: id_ for id_, node in self._nodes.items() if node >= 0} if cycle.moved else {}
         for stamp, pose in cycle.moved:
             self._move(self._cycle_of[stamp], stamp, pose, names)
 
@@ -133,11 +138,16 @@ class Observing:
     @property
     def waiting(self) -> bool:
         """Whether something is to be sent sooner or later."""
-        return bool(self._anchors or self._links or self._retracted) or self.issuance.waiting
+        if self._anchors or self._links or self._retracted:
+            return True
+        return any(issuance.waiting for issuance in (*self._earlier, self.issuance))
 
     def payloads(self, now: float, base: int) -> Iterator[Payload]:
         """What goes out now, cut so that each payload fits into a transaction."""
-        batch = self.issuance.batch(now)
+        while self._earlier and not self._earlier[0].waiting:
+            self._earlier.pop(0)
+        issuance = self._earlier[0] if self._earlier else self.issuance
+        batch = issuance.batch(now)
         if batch is None and not self._due(now):
             return
         nodes = NONE if batch is None else batch.nodes
@@ -157,7 +167,7 @@ class Observing:
             again, sightings, room = _fill(sightings, room)
             each = _FEATURE + _PARENT * self._config.graph.n_p
             count = min(room // each, self._config.issuance.features_per_transaction)
-            bundle = self.issuance.bundle(nodes[:count], base) if len(nodes[:count]) else None
+            bundle = issuance.bundle(nodes[:count], base) if len(nodes[:count]) else None
             yield Payload(name, tuple(mine), bundle, gone, again, links)
             base += len(nodes[:count])
             anchors, retracted, nodes = anchors[len(mine) :], retracted[len(gone) :], nodes[count:]
@@ -174,6 +184,8 @@ class Observing:
         """A session begins: the first one at the start pose, a later one unknown or as before."""
         before = FrameId(self._author, self.session)
         if self._sessions:
+            if self.issuance.waiting:
+                self._earlier.append(self.issuance)
             self._start_frame()
         self.session = session
         if session in self._sessions:
@@ -199,7 +211,7 @@ class Observing:
                 continue
             met.add(id_)
             node = self._nodes.get(id_)
-            if node is None:
+            if node is None or node < 0:
                 new.append(row)
             else:
                 again.append(node)
@@ -230,7 +242,8 @@ class Observing:
             columns.colored[kept],
         )
         for node in old.tolist():
-            self._nodes.pop(names.get(node, -1), None)
+            if node in names:
+                self._nodes[names[node]] = -1
         for before, after in zip(kept.tolist(), nodes.tolist(), strict=True):
             if before in names:
                 self._nodes[names[before]] = after

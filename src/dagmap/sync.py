@@ -7,6 +7,7 @@ empty ledger, so robots that never meet converge through those that do.
 
 from __future__ import annotations
 
+import heapq
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -17,7 +18,7 @@ from .messages import MAX_ECHOES, MAX_MESSAGE, Head, Heads, Message, Transaction
 from .model import AuthorId, TransactionId
 
 MAX_PEERS = 256  # senders are not authenticated here, so their number must be bounded
-_MAX_HEADS = 2500  # of one message
+_MAX_HEADS = 1800  # of one message, and of what is kept of a peer
 _MAX_IDS = 256  # of one question
 _ROOM = MAX_MESSAGE - 64  # for transactions in a message
 Post = tuple[Message, AuthorId | None]
@@ -42,7 +43,9 @@ class Sync:
         self._next_announcement: float | None = None
         self._token = 0
         self._sent_at: OrderedDict[int, float] = OrderedDict()
-        self._asked: dict[AuthorId, tuple[int, float]] = {}  # chain: (end asked for, asked until)
+        self._asked: OrderedDict[AuthorId, tuple[int, float]] = (
+            OrderedDict()
+        )  # chain: (end asked for, asked until)
         self._asked_ids: dict[TransactionId, float] = {}  # id: not to be asked for before
 
     def tick(self, now: float) -> Iterator[Post]:
@@ -57,9 +60,13 @@ class Sync:
         if sender == self._me:
             return
         peer = self._peer(sender)
+        if message.token != peer.token:
+            peer.heads.clear()  # an announcement of several messages has one token
         peer.token, peer.heard = message.token, now
+        waiting = self._ledger.waiting_from()
         for head in message.heads:
-            peer.heads[head.author] = head
+            if len(peer.heads) < _MAX_HEADS and self._promises(head, waiting):
+                peer.heads[head.author] = head
         for whose, token, held in message.echoes:
             if whose == self._me and token in self._sent_at:
                 delay = max(0.0, now - self._sent_at[token] - held / 1e6) / 2
@@ -99,9 +106,9 @@ class Sync:
             known = self._ledger.find(id_)
             if known is not None:
                 yield known.data
-        for author, first, end in message.ranges:
-            for tx in self._ledger.chain(author).main[first:end]:
-                yield tx.data
+        chains = {author: self._ledger.chain(author).main[a:b] for author, a, b in message.ranges}
+        for tx in heapq.merge(*chains.values(), key=lambda tx: tx.key):  # causes first
+            yield tx.data
 
     def _peer(self, sender: AuthorId) -> Peer:
         peer = self.peers.setdefault(sender, Peer())
@@ -112,10 +119,14 @@ class Sync:
 
     def _announce(self, now: float) -> Iterator[Post]:
         heads = [
-            Head(author, chain.end, _tip(chain.main[chain.end - 1].id if chain.end else b""), cut)
+            Head(
+                author,
+                chain.end,
+                _tip(chain.main[chain.end - 1].id if chain.end else b""),
+                chain.cut,
+            )
             for author, chain in self._ledger.chains.items()
-            for cut in (chain.cut is not None,)
-            if chain.end or cut
+            if chain.end or chain.cut is not None
         ]
         self._token += 1
         self._sent_at[self._token] = now
@@ -128,18 +139,29 @@ class Sync:
 
     def _ask(self, sender: AuthorId, peer: Peer, now: float) -> Iterator[Post]:
         ranges, proofs = [], []
+        waiting = self._ledger.waiting_from()
         for head in peer.heads.values():
-            chain = self._ledger.chain(head.author)
-            if head.cut and (chain.cut is None or chain.cut > head.length):
+            if self._proves(head):
                 proofs.append(head.author)
-            wanted = self._wanted(head)
+            wanted = self._wanted(head, waiting)
             if wanted is not None and now >= self._asked.get(head.author, (0, now))[1]:
                 self._asked[head.author] = (wanted[1], now + self._config.retry_period)
+                self._asked.move_to_end(head.author)
+                if len(self._asked) > 2 * _MAX_HEADS:
+                    self._asked.popitem(last=False)
                 ranges.append((head.author, *wanted))
         if ranges or proofs:
-            yield Want(tuple(ranges[:_MAX_HEADS]), (), tuple(proofs[:_MAX_HEADS])), sender
+            yield Want(tuple(ranges), (), tuple(proofs)), sender
 
-    def _wanted(self, head: Head) -> tuple[int, int] | None:
+    def _promises(self, head: Head, waiting: dict[AuthorId, int]) -> bool:
+        return self._proves(head) or self._wanted(head, waiting) is not None
+
+    def _proves(self, head: Head) -> bool:
+        """Whether a head announces a fork that is not known here."""
+        cut = self._ledger.chain(head.author).cut
+        return head.cut is not None and (cut is None or head.cut < cut)
+
+    def _wanted(self, head: Head, waiting: dict[AuthorId, int]) -> tuple[int, int] | None:
         """The range of an author's chain that a head promises and that is lacking here."""
         chain = self._ledger.chain(head.author)
         mine = len(chain.main)
@@ -148,9 +170,7 @@ class Sync:
             counts = chain.cut is None or head.length <= chain.cut
             return (head.length - 1, head.length) if differs and counts else None
         end = head.length if chain.cut is None else min(head.length, chain.cut)
-        waiting = self._ledger.waiting_from(head.author)
-        if waiting is not None:
-            end = min(end, waiting)
+        end = min(end, waiting.get(head.author, end))
         return (mine, end) if end > mine else None
 
     def _ask_for_missing(self, now: float) -> Iterator[Post]:
@@ -159,8 +179,10 @@ class Sync:
         for id_ in self._asked_ids.keys() - set(missing):
             del self._asked_ids[id_]
         due = []
-        for id_ in missing[:_MAX_IDS]:
-            if now >= self._asked_ids.setdefault(id_, now + self._config.retry_period / 4):
+        for id_ in missing:
+            self._asked_ids.setdefault(id_, now + self._config.retry_period / 4)
+        for id_ in sorted(self._asked_ids, key=self._asked_ids.__getitem__)[:_MAX_IDS]:
+            if now >= self._asked_ids[id_]:  # longest due first: junk cannot keep others out
                 self._asked_ids[id_] = now + self._config.retry_period
                 due.append(id_)
         if due and self.peers:

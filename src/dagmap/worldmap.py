@@ -103,6 +103,7 @@ class WorldMap:
         if centre.shape != (3,) or not radius >= 0:
             raise ValueError("near wants a point (3,) in metres and a radius of at least 0")
         index = self._grid.around(centre, radius)
+        index = np.flatnonzero(self.kept) if index is None else index
         distance = np.linalg.norm(self.positions[index] - centre, axis=1)
         order = np.argsort(distance, kind="stable")
         return index[order[: int((distance <= radius).sum())]]
@@ -171,12 +172,14 @@ class _Grid:
         order = np.argsort(keys, kind="stable")
         self._keys, self._index = keys[order], index[order]
 
-    def around(self, centre: Floats, radius: float) -> Int64s:
-        """Indices in all cells that a ball touches."""
+    def around(self, centre: Floats, radius: float) -> Int64s | None:
+        """Indices in all cells that a ball touches; None where that costs more than to look at all."""
         low = np.clip(np.floor((centre - radius) / self.EDGE) - self._low, 0, self._size - 1)
         high = np.clip(np.floor((centre + radius) / self.EDGE) - self._low, -1, self._size - 1)
         if (high < low).any():
             return np.zeros(0, np.int64)
+        if (high[0] - low[0] + 1) * (high[1] - low[1] + 1) > len(self._index) + 64:
+            return None
         xs, ys = (np.arange(low[a], high[a] + 1) for a in (0, 1))
         columns = np.stack(np.meshgrid(xs, ys, indexing="ij"), -1).reshape(-1, 2)
         first = self._key(np.column_stack([columns, np.full(len(columns), low[2])]))

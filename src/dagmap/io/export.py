@@ -119,7 +119,9 @@ def write_ply(path: Path, world: MapLike) -> None:
         vertices[name] = world.colors[:, channel]
     vertices["state"] = world.states
     for name in ("hits", "misses", "witnesses"):
-        vertices[name] = np.minimum(np.asarray(getattr(world, name), np.int64), np.iinfo(_DTYPE[name]).max)
+        vertices[name] = np.minimum(
+            np.asarray(getattr(world, name), np.int64), np.iinfo(_DTYPE[name]).max
+        )
     with atomic_write(path) as file:
         file.write(_HEADER.format(count=len(vertices)).encode())
         file.write(vertices.tobytes())

@@ -15,7 +15,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from ..model import Bools, Int32s, Int64s, Uint8s
-from .jit import kernel
+from .inner import inner
+from .leaf import leaf
 
 NODES, ENTRIES, SERIAL = 0, 1, 2  # places in Graph.sizes
 AUTHOR, SEEN, NEXT = 0, 1, 2  # columns of Graph.entries
@@ -50,42 +51,50 @@ class Seen(NamedTuple):
     parents: Int64s
 
 
-@kernel
+@leaf
 def split(
-    base: int, alive: Bools, parents: Int64s, cores: Int64s, order: Int64s, starts: Int64s
+    base: int,
+    alive: Bools,
+    parents: Int64s,
+    cores: Int64s,
+    order: Int64s,
+    starts: Int64s,
+    owner: Int64s,
+    place: Int64s,
 ) -> None:
     """Cut a block into bundles: bundle j is order[starts[j]:starts[j + 1]], its core first.
 
     A bundle holds its core and those of the core's ascendants in the block that are in no earlier
     bundle. What is not alive is left out; where that is the core, the highest number left takes
-    its place. After the core the numbers ascend. order (n,), starts (k + 1,) are written.
+    its place. After the core the numbers ascend. order (n,), starts (k + 1,) are written; owner
+    (n,) and place (k + 1,) are room to work in.
     """
     n, k = alive.shape[0], cores.shape[0]
-    owner = order.copy()  # of each feature: its bundle, k where it is in none
-    owner[:] = k
-    stack = owner.copy()
+    for i in range(n):
+        owner[i] = k  # of each feature: its bundle, k where it is in none
     for j in range(k):
         depth = 0
         if 0 <= cores[j] < n and owner[cores[j]] == k:
             owner[cores[j]] = j
-            stack[0] = cores[j]
+            order[0] = cores[j]  # a stack, for now
             depth = 1
         while depth > 0:
             depth -= 1
-            i = int(stack[depth])
+            i = int(order[depth])
             for column in range(parents.shape[1]):
                 parent = int(parents[i, column]) - base
                 if 0 <= parent < i and owner[parent] == k:
                     owner[parent] = j
-                    stack[depth] = parent
+                    order[depth] = parent
                     depth += 1
-    starts[:] = 0
+    for j in range(k + 1):
+        starts[j] = 0
     for i in range(n):
         if alive[i] and owner[i] < k:
             starts[owner[i] + 1] += 1
     for j in range(k):
         starts[j + 1] += starts[j]
-    place = starts.copy()
+        place[j] = starts[j]
     for i in range(n - 1, -1, -1):  # the highest number of a bundle, its core, comes first
         j = int(owner[i])
         if alive[i] and j < k:
@@ -97,7 +106,7 @@ def split(
                 order[place[j]] = i
 
 
-@kernel
+@inner
 def _distance2(graph: Graph, node: int, xyz: Int32s, i: int) -> int:
     dx = int(graph.seed[node, 0]) - int(xyz[i, 0])
     dy = int(graph.seed[node, 1]) - int(xyz[i, 1])
@@ -105,7 +114,7 @@ def _distance2(graph: Graph, node: int, xyz: Int32s, i: int) -> int:
     return dx * dx + dy * dy + dz * dz
 
 
-@kernel
+@inner
 def _nearest(graph: Graph, xyz: Int32s, i: int, found: int) -> tuple[int, int]:
     """GetAdjacentNodes: nearest of the `found` nodes (of all where -1) and its squared distance.
 
@@ -120,7 +129,7 @@ def _nearest(graph: Graph, xyz: Int32s, i: int, found: int) -> tuple[int, int]:
     return at, best
 
 
-@kernel
+@inner
 def _ascendants(graph: Graph, node: int) -> int:
     """GetAscendants: what a node refers to, directly or indirectly, into graph.found; how many."""
     serial = int(graph.sizes[SERIAL]) + 1
@@ -139,7 +148,7 @@ def _ascendants(graph: Graph, node: int) -> int:
     return found
 
 
-@kernel
+@inner
 def _observe(graph: Graph, node: int, author: int, seen: Seen, i: int) -> None:
     for axis in range(3):
         graph.offset[node, axis] += int(seen.xyz[i, axis]) - int(graph.seed[node, axis])
@@ -162,7 +171,7 @@ def _observe(graph: Graph, node: int, author: int, seen: Seen, i: int) -> None:
     graph.witnesses[node] += 1
 
 
-@kernel
+@inner
 def _add(graph: Graph, seen: Seen, i: int) -> int:
     """Add a feature to U."""
     node = int(graph.sizes[NODES])
@@ -181,7 +190,7 @@ def _add(graph: Graph, seen: Seen, i: int) -> int:
     return node
 
 
-@kernel
+@inner
 def _refer(graph: Graph, node: int, seen: Seen, i: int, base: int, features: Int32s) -> None:
     """Let an added node refer to the nodes that its wire parents ended in."""
     for column in range(graph.parents.shape[1]):
@@ -190,26 +199,28 @@ def _refer(graph: Graph, node: int, seen: Seen, i: int, base: int, features: Int
         graph.parents[node, column] = features[parent] if known else -1
 
 
-@kernel
+@inner
 def _merge(
     graph: Graph,
     delta2: int,
     author: int,
     seen: Seen,
     base: int,
-    bundle: Int64s,
+    order: Int64s,
+    begin: int,
+    end: int,
     features: Int32s,
     losers: Int32s,
 ) -> None:
     """Algorithm 2; line numbers count from below its Input."""
     before = int(graph.sizes[NODES])
-    n = int(bundle[0])  # Alg. 2, l. 1
+    n = int(order[begin])  # Alg. 2, l. 1
     twin, d2 = _nearest(graph, seen.xyz, n, -1)  # l. 3
     found = _ascendants(graph, twin) if twin >= 0 else 0  # l. 4
-    for k in range(bundle.shape[0]):
-        i = int(bundle[k])
+    for k in range(begin, end):
+        i = int(order[k])
         losers[i] = -1
-        if k > 0 and found > 0:
+        if k > begin and found > 0:
             twin, d2 = _nearest(graph, seen.xyz, i, found)  # l. 16
         if found > 0 and d2 < delta2:  # l. 8, l. 17
             graph.hits[twin] += 1  # l. 9, l. 18
@@ -221,13 +232,13 @@ def _merge(
                 graph.misses[twin] += 1  # l. 13, l. 23
                 losers[i] = twin
         _observe(graph, int(features[base + i]), author, seen, i)
-    for k in range(bundle.shape[0]):
-        i = int(bundle[k])
+    for k in range(begin, end):
+        i = int(order[k])
         if features[base + i] >= before:
             _refer(graph, int(features[base + i]), seen, i, base, features)
 
 
-@kernel
+@leaf
 def apply(
     graph: Graph,
     delta2: int,
@@ -249,11 +260,11 @@ def apply(
         losers[i] = -1
     for j in range(starts.shape[0] - 1):
         if starts[j] < starts[j + 1]:
-            bundle = order[starts[j] : starts[j + 1]]
-            _merge(graph, delta2, author, seen, base, bundle, features, losers)
+            begin, end = int(starts[j]), int(starts[j + 1])
+            _merge(graph, delta2, author, seen, base, order, begin, end, features, losers)
 
 
-@kernel
+@inner
 def _unobserve(graph: Graph, node: int, author: int, seen: Seen, i: int) -> None:
     for axis in range(3):
         graph.offset[node, axis] -= int(seen.xyz[i, axis]) - int(graph.seed[node, axis])
@@ -271,7 +282,7 @@ def _unobserve(graph: Graph, node: int, author: int, seen: Seen, i: int) -> None
         graph.witnesses[node] -= 1
 
 
-@kernel
+@leaf
 def revert(
     graph: Graph,
     author: int,

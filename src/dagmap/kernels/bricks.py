@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..model import Int32s, Int64s
-from .jit import kernel
+from .inner import inner
+from .leaf import leaf
 from .rays import BRICK, CELLS, ENTRY, ROWS, ZERO, ZEROED, Marks
 
 Int8s: TypeAlias = npt.NDArray[np.int8]
@@ -44,7 +45,7 @@ class Bricks(NamedTuple):
     wide: Int32s  # (W, 64) as `small`
 
 
-@kernel
+@inner
 def _bucket(top: Int64s, mask: int, x: int, y: int, z: int) -> int:
     u = int(top[KEY]) * (x + _LOW)
     v = int(top[KEY + 1]) * (y + _LOW)
@@ -54,7 +55,7 @@ def _bucket(top: Int64s, mask: int, x: int, y: int, z: int) -> int:
     return (h if h < _P else h - _P) & mask
 
 
-@kernel
+@inner
 def _find(top: Int64s, buckets: Int32s, brick: Int32s, x: int, y: int, z: int) -> int:
     b = int(buckets[_bucket(top, buckets.shape[0] - 1, x, y, z)])
     while b >= 0 and (brick[b, 0] != x or brick[b, 1] != y or brick[b, 2] != z):
@@ -62,7 +63,7 @@ def _find(top: Int64s, buckets: Int32s, brick: Int32s, x: int, y: int, z: int) -
     return b
 
 
-@kernel
+@inner
 def _new_brick(top: Int64s, buckets: Int32s, brick: Int32s, x: int, y: int, z: int) -> int:
     b = int(top[FREE_BRICK])
     if b >= 0:
@@ -81,7 +82,7 @@ def _new_brick(top: Int64s, buckets: Int32s, brick: Int32s, x: int, y: int, z: i
     return b
 
 
-@kernel
+@inner
 def _free_brick(top: Int64s, buckets: Int32s, brick: Int32s, b: int) -> None:
     x, y, z = int(brick[b, 0]), int(brick[b, 1]), int(brick[b, 2])
     bucket = _bucket(top, buckets.shape[0] - 1, x, y, z)
@@ -98,7 +99,7 @@ def _free_brick(top: Int64s, buckets: Int32s, brick: Int32s, b: int) -> None:
     top[LIVE] -= 1
 
 
-@kernel
+@inner
 def _find_entry(brick: Int32s, entry: Int32s, b: int, author: int) -> int:
     e = int(brick[b, FIRST])
     while e >= 0:
@@ -108,7 +109,7 @@ def _find_entry(brick: Int32s, entry: Int32s, b: int, author: int) -> int:
     return -1
 
 
-@kernel
+@inner
 def _new_entry(top: Int64s, brick: Int32s, entry: Int32s, b: int, author: int) -> int:
     e = int(top[FREE_ENTRY])
     if e >= 0:
@@ -124,7 +125,7 @@ def _new_entry(top: Int64s, brick: Int32s, entry: Int32s, b: int, author: int) -
     return e
 
 
-@kernel
+@inner
 def _drop_entry(top: Int64s, brick: Int32s, entry: Int32s, b: int, e: int) -> None:
     if brick[b, FIRST] == e:
         brick[b, FIRST] = entry[e, NEXT]
@@ -137,7 +138,7 @@ def _drop_entry(top: Int64s, brick: Int32s, entry: Int32s, b: int, e: int) -> No
     top[FREE_ENTRY] = e
 
 
-@kernel
+@inner
 def _new_block(top: Int64s, block: Int32s, used: int, free: int) -> int:
     """A zero row of `Bricks.word` or `wide`; used, free: the places in `top` that belong to it."""
     c = int(top[free])
@@ -151,7 +152,7 @@ def _new_block(top: Int64s, block: Int32s, used: int, free: int) -> int:
     return c
 
 
-@kernel
+@inner
 def _widen(top: Int64s, small: Int8s, word: Int32s, wide: Int32s, c: int) -> int:
     """Move a small block to a wide one."""
     w = _new_block(top, wide, WIDE, FREE_WIDE)
@@ -162,7 +163,7 @@ def _widen(top: Int64s, small: Int8s, word: Int32s, wide: Int32s, c: int) -> int
     return w
 
 
-@kernel
+@leaf
 def find_entries(bricks: Bricks, marks: Marks, author: int) -> bool:
     """Give every row of the marks its entry; False where there is too little room."""
     top, buckets, brick, entry = bricks.top, bricks.buckets, bricks.brick, bricks.entry
@@ -182,7 +183,7 @@ def find_entries(bricks: Bricks, marks: Marks, author: int) -> bool:
     return True
 
 
-@kernel
+@leaf
 def add_cells(bricks: Bricks, marks: Marks, sign: int, begin: int) -> int:
     """Add `sign` to what is listed from `begin` on, but where a point ended only to its ends.
 
@@ -219,7 +220,7 @@ def add_cells(bricks: Bricks, marks: Marks, sign: int, begin: int) -> int:
     return count
 
 
-@kernel
+@inner
 def _is_zero(block: Int32s, c: int) -> bool:
     rest = 0
     for i in range(block.shape[1]):
@@ -227,7 +228,7 @@ def _is_zero(block: Int32s, c: int) -> bool:
     return rest == 0
 
 
-@kernel
+@inner
 def _free_if_zero(top: Int64s, word: Int32s, wide: Int32s, c: int) -> int:
     """The block as it is, or NONE where it was zero and is free now."""
     if c >= 0 and _is_zero(word, c):
@@ -241,7 +242,7 @@ def _free_if_zero(top: Int64s, word: Int32s, wide: Int32s, c: int) -> int:
     return c
 
 
-@kernel
+@leaf
 def free_zeros(bricks: Bricks, marks: Marks) -> None:
     """Free the blocks that have become zero, and the entries and bricks that this leaves empty."""
     top, brick, entry, row = bricks.top, bricks.brick, bricks.entry, marks.row
@@ -262,7 +263,7 @@ def free_zeros(bricks: Bricks, marks: Marks) -> None:
                 _free_brick(top, bricks.buckets, brick, b)
 
 
-@kernel
+@leaf
 def rebuild(bricks: Bricks) -> None:
     """Fill a new, empty array of buckets (all -1)."""
     top, buckets, brick = bricks.top, bricks.buckets, bricks.brick
@@ -274,14 +275,14 @@ def rebuild(bricks: Bricks) -> None:
             buckets[bucket] = b
 
 
-@kernel
+@inner
 def _counter(small: Int8s, wide: Int32s, c: int, at: int) -> int:
     if c >= 0:
         return int(small[c, at])
     return 0 if c == NONE else int(wide[-2 - c, at])
 
 
-@kernel
+@leaf
 def read(bricks: Bricks, cell: int, xyz: Int32s, passes: Int32s, ends: Int32s) -> None:
     """passes, ends (N, A) of the cells of xyz (N, 3); both come in as zeros."""
     top, buckets, brick = bricks.top, bricks.buckets, bricks.brick
@@ -298,7 +299,7 @@ def read(bricks: Bricks, cell: int, xyz: Int32s, passes: Int32s, ends: Int32s) -
             e = int(entry[e, NEXT])
 
 
-@kernel
+@inner
 def _misses(
     entry: Int32s, small: Int8s, wide: Int32s, e: int, layer: int, at: int, say: int
 ) -> int:
@@ -313,7 +314,7 @@ def _misses(
     return misses
 
 
-@kernel
+@leaf
 def judge(
     bricks: Bricks,
     cell: int,

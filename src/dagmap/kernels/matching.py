@@ -11,7 +11,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from ..model import Bools, Int32s, Int64s, Uint8s
-from .jit import kernel
+from .inner import inner
+from .leaf import leaf
 
 # Hashes are a x + b y + c z + d modulo the prime p with secret a, b, c, d: whatever coordinates
 # somebody chooses, two of them collide with probability 1/p (Carter and Wegman, 1979).
@@ -51,7 +52,7 @@ class Seen(NamedTuple):
     sighting_cycle: Int32s
 
 
-@kernel
+@inner
 def _bucket(key: Int64s, mask: int, cx: int, cy: int, cz: int) -> int:
     """Bucket of a cell: a hash of its octet (2^3 cells), the cell in the octet in the low bits."""
     u = int(key[0]) * ((cx >> 1) + _LOW)
@@ -64,7 +65,7 @@ def _bucket(key: Int64s, mask: int, cx: int, cy: int, cz: int) -> int:
     return ((h << 3) | (cx & 1) | ((cy & 1) << 1) | ((cz & 1) << 2)) & mask
 
 
-@kernel
+@inner
 def find_twin(nodes: Nodes, shift: int, reach: int, x: int, y: int, z: int) -> int:
     """Node with the nearest seed within `reach` mm, ties to the lower id; -1 where there is none.
 
@@ -90,7 +91,7 @@ def find_twin(nodes: Nodes, shift: int, reach: int, x: int, y: int, z: int) -> i
     return twin
 
 
-@kernel
+@inner
 def _create(nodes: Nodes, shift: int, x: int, y: int, z: int) -> int:
     node = int(nodes.sizes[NODES])
     mask = nodes.buckets.shape[0] - 1
@@ -109,7 +110,7 @@ def _create(nodes: Nodes, shift: int, x: int, y: int, z: int) -> int:
     return node
 
 
-@kernel
+@inner
 def _discard_newest(nodes: Nodes, shift: int) -> None:
     node = int(nodes.sizes[NODES]) - 1
     cx = int(nodes.seed[node, X]) >> shift
@@ -120,7 +121,7 @@ def _discard_newest(nodes: Nodes, shift: int) -> None:
     nodes.sizes[NODES] = node
 
 
-@kernel
+@inner
 def _hit(nodes: Nodes, node: int, author: int, cycle: int) -> int:
     """Count a hit once per author and cycle. Returns what `_take_back` needs."""
     entry = int(nodes.first[node])
@@ -143,7 +144,7 @@ def _hit(nodes: Nodes, node: int, author: int, cycle: int) -> int:
     return FIRST_SEEN
 
 
-@kernel
+@inner
 def _take_back(nodes: Nodes, node: int, author: int, before: int) -> None:
     if before == NOT_COUNTED:
         return
@@ -158,7 +159,7 @@ def _take_back(nodes: Nodes, node: int, author: int, before: int) -> None:
     nodes.entries[entry, CYCLE] = before
 
 
-@kernel
+@inner
 def _accumulate(nodes: Nodes, node: int, seen: Seen, i: int, sign: int) -> None:
     nodes.observed[node] += sign
     for axis in range(3):
@@ -169,7 +170,7 @@ def _accumulate(nodes: Nodes, node: int, seen: Seen, i: int, sign: int) -> None:
             nodes.color[node, channel] += sign * int(seen.color[i, channel])
 
 
-@kernel
+@leaf
 def apply(
     nodes: Nodes,
     shift: int,
@@ -206,7 +207,7 @@ def apply(
             undo[count + j] = _hit(nodes, int(features[number]), author, cycle)
 
 
-@kernel
+@leaf
 def revert(
     nodes: Nodes,
     shift: int,
@@ -232,7 +233,7 @@ def revert(
             _discard_newest(nodes, shift)
 
 
-@kernel
+@leaf
 def rebuild(nodes: Nodes, shift: int) -> None:
     """Fill a new, empty array of buckets (all -1); chains come out the newest first again."""
     mask = nodes.buckets.shape[0] - 1

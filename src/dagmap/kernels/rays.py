@@ -14,7 +14,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from ..model import Bools, Int32s, Int64s, Uint8s
-from .jit import kernel
+from .inner import inner
+from .leaf import leaf
 
 # Keyed hash modulo a prime as in `matching` (repeated here: see the trap in `jit`).
 _P = (1 << 31) - 1
@@ -41,7 +42,7 @@ class Marks(NamedTuple):
     cell: Int64s  # (L,) the cells: number of the bit
 
 
-@kernel
+@inner
 def _seek(top: Int64s, table: Int32s, row: Int32s, x: int, y: int, z: int) -> int:
     """Row of a brick, or -1 - (the slot of the table for it). Slots of earlier calls are stale."""
     u = int(top[KEY]) * (x + _LOW)
@@ -59,7 +60,7 @@ def _seek(top: Int64s, table: Int32s, row: Int32s, x: int, y: int, z: int) -> in
         slot = (slot + 1) & (table.shape[0] - 1)
 
 
-@kernel
+@inner
 def _new_row(
     top: Int64s, table: Int32s, row: Int32s, word: Int64s, slot: int, x: int, y: int, z: int
 ) -> int:
@@ -77,14 +78,14 @@ def _new_row(
     return r
 
 
-@kernel
+@inner
 def _enter(top: Int64s, table: Int32s, row: Int32s, word: Int64s, x: int, y: int, z: int) -> int:
     """Row of a brick, an empty one where the call has none yet."""
     r = _seek(top, table, row, x, y, z)
     return r if r >= 0 else _new_row(top, table, row, word, -1 - r, x, y, z)
 
 
-@kernel
+@inner
 def ceil_sqrt(value: int) -> int:
     """The smallest integer whose square is at least `value` (0 to 2^62), by Newton's method."""
     if value <= 1:
@@ -101,13 +102,13 @@ def ceil_sqrt(value: int) -> int:
         root = better
 
 
-@kernel
+@inner
 def _cut(d: int, limit: int, length: int) -> int:
     """One component of a ray shortened from `length` to `limit`, towards its origin."""
     return d * limit // length if d >= 0 else -(-d * limit // length)
 
 
-@kernel
+@inner
 def _ray(limit: int, ox: int, oy: int, oz: int, px: int, py: int, pz: int) -> tuple[int, int, int]:
     """From an origin to a point, at most `limit` mm long."""
     dx, dy, dz = px - ox, py - oy, pz - oz
@@ -118,7 +119,7 @@ def _ray(limit: int, ox: int, oy: int, oz: int, px: int, py: int, pz: int) -> tu
     return dx, dy, dz
 
 
-@kernel
+@inner
 def _first_crossing(cell: int, origin: int, d: int, scale: int) -> int:
     """Twice the time of an axis' first crossing, times the product of all |d|; + 1 if falling."""
     if d > 0:
@@ -128,33 +129,33 @@ def _first_crossing(cell: int, origin: int, d: int, scale: int) -> int:
     return _NEVER
 
 
-@kernel
+@inner
 def _rates(dx: int, dy: int, dz: int) -> tuple[int, int, int]:
     """Per axis the product of the other two |d| (1 for an axis that stands still)."""
     x, y, z = max(abs(dx), 1), max(abs(dy), 1), max(abs(dz), 1)
     return y * z, x * z, x * y
 
 
-@kernel
+@inner
 def _stride(d: int, axis: int) -> int:
     """What one step along an axis adds to the place on the ray."""
     step = 1 << (3 * axis)
     return (step if d > 0 else -step) - (1 << (_LEFT + 8 * axis))
 
 
-@kernel
+@inner
 def _steps_left(c: int, d: int) -> int:
     """Steps from a cell along one axis that stay in its brick."""
     return 7 - (c & 7) if d > 0 else c & 7
 
 
-@kernel
+@inner
 def _bit(cx: int, cy: int, cz: int) -> int:
     """Number of a cell's bit in its row."""
     return (cz & 7) << 6 | (cy & 7) << 3 | (cx & 7)
 
 
-@kernel
+@inner
 def _mark(bits: Uint8s, cells: Int64s, count: int, at: int) -> int:
     """Set a bit and, where it was not set, list it: how many are listed then (one may be spare)."""
     before = int(bits[at >> 3])
@@ -163,32 +164,32 @@ def _mark(bits: Uint8s, cells: Int64s, count: int, at: int) -> int:
     return count + 1 - ((before >> (at & 7)) & 1)
 
 
-@kernel
+@inner
 def _has_room(top: Int64s, row: Int32s, cells: Int64s, steps: int) -> bool:
     """Whether a ray of so many steps finds rows and places in the list for certain."""
     rows = row.shape[0] - int(top[ROWS]) - (steps // 8 + 4)
     return bool(min(rows, cells.shape[0] - int(top[CELLS]) - (steps + 2)) >= 0)
 
 
-@kernel
+@inner
 def _walk(
     marks: Marks,
     cell: int,
     limit: int,
-    origin: Int32s,
+    origins: Int32s,
+    k: int,
     xyz: Int32s,
     alive: Bools,
     last: Int64s,
     begin: int,
     end: int,
 ) -> bool:
-    """Mark the cells from the origin (3,) to the points begin to end - 1, both ends included.
+    """Mark the cells from origin k to the points begin to end - 1, both ends included.
 
     last (n,) gets the bit that a ray marks last, -1 where the ray was cut. False: too little room.
     """
-    # One function, arrays in locals: a call that hands arrays on may cost more than twenty steps.
     top, table, row, bits, word, cells = marks
-    ox, oy, oz = int(origin[0]), int(origin[1]), int(origin[2])
+    ox, oy, oz = int(origins[k, 0]), int(origins[k, 1]), int(origins[k, 2])
     cx, cy, cz = ox // cell, oy // cell, oz // cell
     for i in range(begin, end):
         if not alive[i]:
@@ -215,19 +216,17 @@ def _walk(
             x = ~((ty | tz) >> 63)  # -1 where x is next, else 0: nobody can predict a branch here
             y = ((ty - tz - 1) >> 63) & ~x
             z = ~(x | y)
-            k = (x & kx) + (y & ky) + (z & kz)
-            at += k
+            stride = (x & kx) + (y & ky) + (z & kz)
+            at += stride
             ty += (y & uy) - (x & ux)
             tz += (z & uz) - (x & ux)
             if at & _BORROWED:
-                at -= 8 * k + (r << 10)  # in at the other side
+                at -= 8 * stride + (r << 10)  # in at the other side
                 bx, by, bz = bx + (x & gx), by + (y & gy), bz + (z & gz)
                 side = (y & 2) + (z & 4) + (((x & gx) + (y & gy) + (z & gz) + 1) >> 1)
                 beyond = int(row[r, side])
                 if beyond < 0:
-                    beyond = _seek(top, table, row, bx, by, bz)
-                    if beyond < 0:
-                        beyond = _new_row(top, table, row, word, -1 - beyond, bx, by, bz)
+                    beyond = _enter(top, table, row, word, bx, by, bz)
                     row[r, side] = beyond
                     row[beyond, side ^ 1] = r
                 r = beyond
@@ -239,7 +238,7 @@ def _walk(
     return True
 
 
-@kernel
+@inner
 def _mark_ends(marks: Marks, cell: int, xyz: Int32s, alive: Bools, last: Int64s) -> bool:
     """Mark the cells in which points end; `last` where it is known. False: too little room."""
     top, table, row, bits, word, cells = marks
@@ -257,7 +256,7 @@ def _mark_ends(marks: Marks, cell: int, xyz: Int32s, alive: Bools, last: Int64s)
     return True
 
 
-@kernel
+@leaf
 def mark_rays(
     marks: Marks,
     cell: int,
@@ -275,10 +274,11 @@ def mark_rays(
     """
     marks.top[ROWS] = 0
     marks.top[CELLS] = 0
-    last[:] = -1
+    for i in range(xyz.shape[0]):
+        last[i] = -1
     if limit > 0:
         for k in range(origins.shape[0]):
             begin, end = int(starts[k]), int(starts[k + 1])
-            if not _walk(marks, cell, limit, origins[k], xyz, alive, last, begin, end):
+            if not _walk(marks, cell, limit, origins, k, xyz, alive, last, begin, end):
                 return False
     return _mark_ends(marks, cell, xyz, alive, last)
