@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import naive_codec
+import naive as naive_codec
 from dagmap.kernels.codec import decode_features, encode_features, morton_order
 
 LIMIT = 1 << 29

@@ -17,7 +17,7 @@ from dagmap.evidence import RayEvidence
 from dagmap.fold import Block, Fold, NodeColumns, PaperFold, Verdict, make_fold
 from dagmap.kernels.rays import ceil_sqrt
 from dagmap.model import LIMIT_MM, State
-from naive_fold import NaiveMap, NaiveRays, naive_default, naive_paper, naive_verdict, points
+from naive import NaiveMap, NaiveRays, naive_default, naive_paper, naive_verdict, points
 
 COMPILED = not numba.config.DISABLE_JIT
 SOME = settings(max_examples=100 if COMPILED else 40, deadline=None)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from dagmap.config import GraphConfig
 from dagmap.graph import AdjacencyDag
 from dagmap.model import LIMIT_MM, CycleError
-from naive_graph import MOST, NaiveDag, Point
+from naive import MOST, NaiveDag, Point
 
 COMPILED = not numba.config.DISABLE_JIT
 SOME = settings(max_examples=150 if COMPILED else 15, deadline=None)

@@ -201,7 +201,7 @@ class AdjacencyDag:
 
     def children_count(self, ids: npt.ArrayLike | None = None) -> Int64s:
         """(N,) number of children."""
-        return self._nodes[self._rows(ids), lattice.CHILDREN].astype(np.int64)
+        return np.asarray(self._nodes[self._rows(ids), lattice.CHILDREN], np.int64)
 
     def alive(self, ids: npt.ArrayLike | None = None) -> Bools:
         """(N,) not withdrawn."""

@@ -124,9 +124,7 @@ def quantise_cycle(cycle: Cycle) -> QuantisedCycle:
     removed = _ids(() if cycle.removed is None else cycle.removed, f"{where}: removed")
     if len(np.unique(removed)) != len(removed):
         raise CycleError(f"{where}: removed names an id twice; name each withdrawn id once")
-    session = cycle.session
-    whole = isinstance(session, (int, np.integer)) and not isinstance(session, bool)
-    if not whole or not 0 <= session < 1 << 32:
+    if not _is_session(cycle.session):
         raise CycleError(f"{where}: session {cycle.session!r} is not a number from 0 to 2^32 - 1")
     colors = None if cycle.colors is None else _colors(cycle.colors, len(points), where)
     return QuantisedCycle(
@@ -226,6 +224,11 @@ def _ids(ids: npt.ArrayLike | Sequence[int], where: str) -> npt.NDArray[np.uint6
     return array.astype(np.uint64)
 
 
+def _is_session(value: object) -> bool:
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    return whole and 0 <= int(value) < 1 << 32  # type: ignore[call-overload]
+
+
 def _array(values: npt.ArrayLike, where: str) -> npt.NDArray[np.generic]:
     try:
         return np.asarray(values)
@@ -241,7 +244,7 @@ def _colors(colors: npt.ArrayLike, count: int, where: str) -> Uint8s:
         raise CycleError(
             f"{where}: colors are {array.dtype} {array.shape}; ({count}, 3) uint8 is wanted"
         )
-    return array
+    return array.astype(np.uint8, copy=False)
 
 
 def _moved(

@@ -173,7 +173,7 @@ class _Grid:
         self._keys, self._index = keys[order], index[order]
 
     def around(self, centre: Floats, radius: float) -> Int64s | None:
-        """Indices in all cells that a ball touches; None where that costs more than to look at all."""
+        """Indices in all cells that a ball touches; None where looking at all costs less."""
         low = np.clip(np.floor((centre - radius) / self.EDGE) - self._low, 0, self._size - 1)
         high = np.clip(np.floor((centre + radius) / self.EDGE) - self._low, -1, self._size - 1)
         if (high < low).any():

@@ -1,3 +1,3 @@
-"""Arrays in, arrays out: the only home of numba. Every kernel has an obvious twin in tests/naive."""
+"""Arrays in, arrays out: the only home of numba. Each kernel has a twin in tests/naive.py."""
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ def _pop(heap: Int64s, size: int) -> int:
         heap[at] = heap[down]
         at, down = down, 2 * down + 1
     heap[at] = name
-    return least
+    return int(least)
 
 
 @inner

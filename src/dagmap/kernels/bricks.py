@@ -83,34 +83,13 @@ def _new_brick(top: Int64s, buckets: Int32s, brick: Int32s, x: int, y: int, z: i
 
 
 @inner
-def _free_brick(top: Int64s, buckets: Int32s, brick: Int32s, b: int) -> None:
-    x, y, z = int(brick[b, 0]), int(brick[b, 1]), int(brick[b, 2])
-    bucket = _bucket(top, buckets.shape[0] - 1, x, y, z)
-    at = int(buckets[bucket])
-    if at == b:
-        buckets[bucket] = brick[b, OLDER]
-    else:
-        while brick[at, OLDER] != b:
-            at = int(brick[at, OLDER])
-        brick[at, OLDER] = brick[b, OLDER]
-    brick[b, FIRST] = _FREED
-    brick[b, OLDER] = top[FREE_BRICK]
-    top[FREE_BRICK] = b
-    top[LIVE] -= 1
-
-
-@inner
-def _find_entry(brick: Int32s, entry: Int32s, b: int, author: int) -> int:
+def _entry(top: Int64s, brick: Int32s, entry: Int32s, b: int, author: int) -> int:
+    """The entry of a brick and an author, one without blocks where there was none."""
     e = int(brick[b, FIRST])
-    while e >= 0:
-        if entry[e, AUTHOR] == author:
-            return e
+    while e >= 0 and entry[e, AUTHOR] != author:
         e = int(entry[e, NEXT])
-    return -1
-
-
-@inner
-def _new_entry(top: Int64s, brick: Int32s, entry: Int32s, b: int, author: int) -> int:
+    if e >= 0:
+        return e
     e = int(top[FREE_ENTRY])
     if e >= 0:
         top[FREE_ENTRY] = entry[e, NEXT]
@@ -126,41 +105,32 @@ def _new_entry(top: Int64s, brick: Int32s, entry: Int32s, b: int, author: int) -
 
 
 @inner
-def _drop_entry(top: Int64s, brick: Int32s, entry: Int32s, b: int, e: int) -> None:
-    if brick[b, FIRST] == e:
-        brick[b, FIRST] = entry[e, NEXT]
-    else:
-        at = int(brick[b, FIRST])
-        while entry[at, NEXT] != e:
-            at = int(entry[at, NEXT])
-        entry[at, NEXT] = entry[e, NEXT]
-    entry[e, NEXT] = top[FREE_ENTRY]
-    top[FREE_ENTRY] = e
-
-
-@inner
-def _new_block(top: Int64s, block: Int32s, used: int, free: int) -> int:
-    """A zero row of `Bricks.word` or `wide`; used, free: the places in `top` that belong to it."""
-    c = int(top[free])
+def _new_small(top: Int64s, word: Int32s) -> int:
+    c = int(top[FREE_SMALL])
     if c >= 0:
-        top[free] = block[c, 0]
+        top[FREE_SMALL] = word[c, 0]
     else:
-        c = int(top[used])
-        top[used] = c + 1
-    for i in range(block.shape[1]):
-        block[c, i] = 0
+        c = int(top[SMALL])
+        top[SMALL] = c + 1
+    for i in range(16):
+        word[c, i] = 0
     return c
 
 
 @inner
 def _widen(top: Int64s, small: Int8s, word: Int32s, wide: Int32s, c: int) -> int:
     """Move a small block to a wide one."""
-    w = _new_block(top, wide, WIDE, FREE_WIDE)
+    w = int(top[FREE_WIDE])
+    if w >= 0:
+        top[FREE_WIDE] = wide[w, 0]
+    else:
+        w = int(top[WIDE])
+        top[WIDE] = w + 1
     for i in range(64):
         wide[w, i] = small[c, i]
     word[c, 0] = top[FREE_SMALL]
     top[FREE_SMALL] = c
-    return w
+    return -2 - w
 
 
 @leaf
@@ -176,8 +146,7 @@ def find_entries(bricks: Bricks, marks: Marks, author: int) -> bool:
         b = _find(top, buckets, brick, x, y, z)
         if b < 0:
             b = _new_brick(top, buckets, brick, x, y, z)
-        e = _find_entry(brick, entry, b, author)
-        row[r, ENTRY] = e if e >= 0 else _new_entry(top, brick, entry, b, author)
+        row[r, ENTRY] = _entry(top, brick, entry, b, author)
         row[r, ZERO] = 0
     marks.top[ZEROED] = 0
     return True
@@ -204,11 +173,11 @@ def add_cells(bricks: Bricks, marks: Marks, sign: int, begin: int) -> int:
             return i
         c = int(entry[e, column])
         if c == NONE:
-            c = _new_block(top, word, SMALL, FREE_SMALL)
+            c = _new_small(top, word)
             entry[e, column] = c
         counter = sign + (int(small[c, at & 63]) if c >= 0 else int(wide[-2 - c, at & 63]))
         if c >= 0 and not -128 <= counter <= 127:
-            c = -2 - _widen(top, small, word, wide, c)
+            c = _widen(top, small, word, wide, c)
             entry[e, column] = c
         if c >= 0:
             small[c, at & 63] = counter
@@ -242,25 +211,52 @@ def _free_if_zero(top: Int64s, word: Int32s, wide: Int32s, c: int) -> int:
     return c
 
 
+@inner
+def _drop(bricks: Bricks, x: int, y: int, z: int, e: int) -> None:
+    """Free an entry of a brick, and the brick where it was its last."""
+    top, buckets, brick, entry = bricks.top, bricks.buckets, bricks.brick, bricks.entry
+    b = _find(top, buckets, brick, x, y, z)
+    at, before = int(brick[b, FIRST]), -1
+    while at != e:
+        before, at = at, int(entry[at, NEXT])
+    if before < 0:
+        brick[b, FIRST] = entry[e, NEXT]
+    else:
+        entry[before, NEXT] = entry[e, NEXT]
+    entry[e, NEXT] = top[FREE_ENTRY]
+    top[FREE_ENTRY] = e
+    if brick[b, FIRST] >= 0:
+        return
+    bucket = _bucket(top, buckets.shape[0] - 1, x, y, z)
+    at, before = int(buckets[bucket]), -1
+    while at != b:
+        before, at = at, int(brick[at, OLDER])
+    if before < 0:
+        buckets[bucket] = brick[b, OLDER]
+    else:
+        brick[before, OLDER] = brick[b, OLDER]
+    brick[b, FIRST] = _FREED
+    brick[b, OLDER] = top[FREE_BRICK]
+    top[FREE_BRICK] = b
+    top[LIVE] -= 1
+
+
 @leaf
 def free_zeros(bricks: Bricks, marks: Marks) -> None:
     """Free the blocks that have become zero, and the entries and bricks that this leaves empty."""
-    top, brick, entry, row = bricks.top, bricks.brick, bricks.entry, marks.row
+    entry, row = bricks.entry, marks.row
     for r in range(int(marks.top[ROWS])):
         if row[r, ZERO] == 0:
             continue
         e = int(row[r, ENTRY])
         kept = False
         for column in range(PASS, PASS + 2 * LAYERS):
-            c = _free_if_zero(top, bricks.word, bricks.wide, int(entry[e, column]))
+            c = _free_if_zero(bricks.top, bricks.word, bricks.wide, int(entry[e, column]))
             entry[e, column] = c
             kept = kept or c != NONE
         if not kept:
             x, y, z = int(row[r, BRICK]), int(row[r, BRICK + 1]), int(row[r, BRICK + 2])
-            b = _find(top, bricks.buckets, brick, x, y, z)
-            _drop_entry(top, brick, entry, b, e)
-            if brick[b, FIRST] < 0:
-                _free_brick(top, bricks.buckets, brick, b)
+            _drop(bricks, x, y, z, e)
 
 
 @leaf

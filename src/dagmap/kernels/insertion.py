@@ -80,7 +80,7 @@ def insert(
         validity[node] = valid(nodes, validity, n_p, node)  # Alg. 1, l. 10
         add(nodes, pool, numbers, home(nodes, pool, table, numbers, node), node)  # the last line
         numbers[NODES] = node + 1
-    return numbers[NODES]
+    return int(numbers[NODES])
 
 
 @kernel
@@ -92,7 +92,7 @@ def reopen(
         if numbers[POOLED] + 9 > pool.shape[0]:
             return i
         add(nodes, pool, numbers, home(nodes, pool, table, numbers, ids[i]), ids[i])
-    return ids.shape[0]
+    return int(ids.shape[0])
 
 
 @inner

@@ -30,7 +30,7 @@ SCRATCH = 1024  # four numbers for each record that waits in a tree search: 7 a 
 X, Y, Z, NEXT, CHILD, CHILDREN, FLAGS, PARENTS = 0, 1, 2, 3, 4, 5, 6, 7
 ISSUED, WITHDRAWN, MARKED = 1, 2, 4  # bits of FLAGS
 # Columns of `pool`, one row a cell or a record of a tree: the lowest corner of its box; the first
-# terminal of its list, or -1, or -2 - i: eight records from row i on; the number of terminals below;
+# terminal of its list, or -1, or -2 - i: eight records from row i on; the terminals below it;
 # in a cell the children of the lattice node, in a record -1 - i: no terminal below is older than i.
 LINK, COUNT, TAKEN, LEAST = 3, 4, 5, 5
 POOL_COLUMNS = 6

@@ -43,46 +43,32 @@ class Marks(NamedTuple):
 
 
 @inner
-def _seek(top: Int64s, table: Int32s, row: Int32s, x: int, y: int, z: int) -> int:
-    """Row of a brick, or -1 - (the slot of the table for it). Slots of earlier calls are stale."""
+def _enter(top: Int64s, table: Int32s, row: Int32s, word: Int64s, x: int, y: int, z: int) -> int:
+    """Row of a brick, an empty one where the call has none yet."""
     u = int(top[KEY]) * (x + _LOW)
     v = int(top[KEY + 1]) * (y + _LOW)
     w = int(top[KEY + 2]) * (z + _LOW)
     h = int(top[KEY + 3]) + (u & _P) + (u >> 31) + (v & _P) + (v >> 31) + (w & _P) + (w >> 31)
     h = (h & _P) + (h >> 31)
-    slot = int((h if h < _P else h - _P) & (table.shape[0] - 1))
-    while True:
-        r = int(table[slot])
-        if r >= int(top[ROWS]) or row[r, SLOT] != slot:
-            return -1 - slot
+    slot = (h if h < _P else h - _P) & (table.shape[0] - 1)
+    rows = int(top[ROWS])
+    r = int(table[slot])
+    while r < rows and row[r, SLOT] == slot:  # else the slot is left from an earlier call
         if row[r, BRICK] == x and row[r, BRICK + 1] == y and row[r, BRICK + 2] == z:
             return r
         slot = (slot + 1) & (table.shape[0] - 1)
-
-
-@inner
-def _new_row(
-    top: Int64s, table: Int32s, row: Int32s, word: Int64s, slot: int, x: int, y: int, z: int
-) -> int:
-    r = int(top[ROWS])
-    top[ROWS] = r + 1
-    table[slot] = r
+        r = int(table[slot])
+    top[ROWS] = rows + 1
+    table[slot] = rows
     for side in range(6):
-        row[r, side] = -1
-    row[r, BRICK] = x
-    row[r, BRICK + 1] = y
-    row[r, BRICK + 2] = z
-    row[r, SLOT] = slot
-    for i in range(r * 16, r * 16 + 16):
+        row[rows, side] = -1
+    row[rows, BRICK] = x
+    row[rows, BRICK + 1] = y
+    row[rows, BRICK + 2] = z
+    row[rows, SLOT] = slot
+    for i in range(rows * 16, rows * 16 + 16):
         word[i] = 0
-    return r
-
-
-@inner
-def _enter(top: Int64s, table: Int32s, row: Int32s, word: Int64s, x: int, y: int, z: int) -> int:
-    """Row of a brick, an empty one where the call has none yet."""
-    r = _seek(top, table, row, x, y, z)
-    return r if r >= 0 else _new_row(top, table, row, word, -1 - r, x, y, z)
+    return rows
 
 
 @inner
@@ -103,19 +89,15 @@ def ceil_sqrt(value: int) -> int:
 
 
 @inner
-def _cut(d: int, limit: int, length: int) -> int:
-    """One component of a ray shortened from `length` to `limit`, towards its origin."""
-    return d * limit // length if d >= 0 else -(-d * limit // length)
-
-
-@inner
 def _ray(limit: int, ox: int, oy: int, oz: int, px: int, py: int, pz: int) -> tuple[int, int, int]:
-    """From an origin to a point, at most `limit` mm long."""
+    """From an origin to a point, at most `limit` mm long: shortened towards the origin."""
     dx, dy, dz = px - ox, py - oy, pz - oz
     d2 = dx * dx + dy * dy + dz * dz
     if d2 > limit * limit:
         length = ceil_sqrt(d2)
-        return _cut(dx, limit, length), _cut(dy, limit, length), _cut(dz, limit, length)
+        dx = dx * limit // length if dx >= 0 else -(-dx * limit // length)
+        dy = dy * limit // length if dy >= 0 else -(-dy * limit // length)
+        dz = dz * limit // length if dz >= 0 else -(-dz * limit // length)
     return dx, dy, dz
 
 
@@ -130,45 +112,12 @@ def _first_crossing(cell: int, origin: int, d: int, scale: int) -> int:
 
 
 @inner
-def _rates(dx: int, dy: int, dz: int) -> tuple[int, int, int]:
-    """Per axis the product of the other two |d| (1 for an axis that stands still)."""
-    x, y, z = max(abs(dx), 1), max(abs(dy), 1), max(abs(dz), 1)
-    return y * z, x * z, x * y
-
-
-@inner
-def _stride(d: int, axis: int) -> int:
-    """What one step along an axis adds to the place on the ray."""
-    step = 1 << (3 * axis)
-    return (step if d > 0 else -step) - (1 << (_LEFT + 8 * axis))
-
-
-@inner
-def _steps_left(c: int, d: int) -> int:
-    """Steps from a cell along one axis that stay in its brick."""
-    return 7 - (c & 7) if d > 0 else c & 7
-
-
-@inner
-def _bit(cx: int, cy: int, cz: int) -> int:
-    """Number of a cell's bit in its row."""
-    return (cz & 7) << 6 | (cy & 7) << 3 | (cx & 7)
-
-
-@inner
 def _mark(bits: Uint8s, cells: Int64s, count: int, at: int) -> int:
     """Set a bit and, where it was not set, list it: how many are listed then (one may be spare)."""
     before = int(bits[at >> 3])
     bits[at >> 3] = before | (1 << (at & 7))
     cells[count] = at
     return count + 1 - ((before >> (at & 7)) & 1)
-
-
-@inner
-def _has_room(top: Int64s, row: Int32s, cells: Int64s, steps: int) -> bool:
-    """Whether a ray of so many steps finds rows and places in the list for certain."""
-    rows = row.shape[0] - int(top[ROWS]) - (steps // 8 + 4)
-    return bool(min(rows, cells.shape[0] - int(top[CELLS]) - (steps + 2)) >= 0)
 
 
 @inner
@@ -197,21 +146,23 @@ def _walk(
         dx, dy, dz = _ray(limit, ox, oy, oz, int(xyz[i, 0]), int(xyz[i, 1]), int(xyz[i, 2]))
         steps = abs((ox + dx) // cell - cx) + abs((oy + dy) // cell - cy)
         steps += abs((oz + dz) // cell - cz)
-        if not _has_room(top, row, cells, steps):
+        count, room = int(top[CELLS]), row.shape[0] - int(top[ROWS])
+        if min(room - steps // 8 - 4, cells.shape[0] - count - steps - 2) < 0:
             return False
-        ux, uy, uz = _rates(dx, dy, dz)
+        ux, uy, uz = max(abs(dx), 1), max(abs(dy), 1), max(abs(dz), 1)
+        ux, uy, uz = uy * uz, ux * uz, ux * uy
         tx = _first_crossing(cell, ox, dx, ux)
         ty = _first_crossing(cell, oy, dy, uy) - tx  # after x
         tz = _first_crossing(cell, oz, dz, uz) - tx
         ux, uy, uz = 2 * cell * ux, 2 * cell * uy, 2 * cell * uz  # between crossings
         gx, gy, gz = 1 if dx > 0 else -1, 1 if dy > 0 else -1, 1 if dz > 0 else -1
-        kx, ky, kz = _stride(dx, 0), _stride(dy, 1), _stride(dz, 2)
+        kx, ky, kz = gx - (1 << _LEFT), 8 * gy - (256 << _LEFT), 64 * gz - (65536 << _LEFT)
         bx, by, bz = cx >> 3, cy >> 3, cz >> 3
         r = _enter(top, table, row, word, bx, by, bz)
-        at = r << 10 | _bit(cx, cy, cz)
-        count = _mark(bits, cells, int(top[CELLS]), at)
-        at |= _steps_left(cx, dx) << _LEFT | _steps_left(cy, dy) << (_LEFT + 8)
-        at |= _steps_left(cz, dz) << (_LEFT + 16)
+        at = (r << 10) | (cz & 7) << 6 | (cy & 7) << 3 | (cx & 7)
+        count = _mark(bits, cells, count, at)
+        left = (cx ^ 7 if dx > 0 else cx) & 7 | ((cy ^ 7 if dy > 0 else cy) & 7) << 8
+        at += (left | ((cz ^ 7 if dz > 0 else cz) & 7) << 16) << _LEFT
         for _ in range(steps):
             x = ~((ty | tz) >> 63)  # -1 where x is next, else 0: nobody can predict a branch here
             y = ((ty - tz - 1) >> 63) & ~x
@@ -245,14 +196,14 @@ def _mark_ends(marks: Marks, cell: int, xyz: Int32s, alive: Bools, last: Int64s)
     for i in range(xyz.shape[0]):
         if not alive[i]:
             continue
-        if not _has_room(top, row, cells, 0):
+        count, at = int(top[CELLS]), int(last[i])
+        if int(top[ROWS]) >= row.shape[0] or count + 1 >= cells.shape[0]:
             return False
-        at = int(last[i])
         if at < 0:
             cx, cy, cz = int(xyz[i, 0]) // cell, int(xyz[i, 1]) // cell, int(xyz[i, 2]) // cell
             r = _enter(top, table, row, word, cx >> 3, cy >> 3, cz >> 3)
-            at = r << 10 | _bit(cx, cy, cz)
-        top[CELLS] = _mark(bits, cells, int(top[CELLS]), at + 512)
+            at = (r << 10) | (cz & 7) << 6 | (cy & 7) << 3 | (cx & 7)
+        top[CELLS] = _mark(bits, cells, count, at + 512)
     return True
 
 
