@@ -58,7 +58,11 @@ class Agent:
     def restore(
         cls, identity: Identity, config: Config | None, transactions: Iterable[bytes]
     ) -> Agent:
-        """An agent that holds these transactions (as `Accepted` gave them) and goes on."""
+        """An agent that holds these transactions (as `Accepted` gave them) and goes on.
+
+        Its adjacency DAG and the ids of the SLAM are those of a new start: where the SLAM was
+        started anew too, give its cycles a new session.
+        """
         agent = cls(identity, config)
         for data in transactions:
             agent._through_the_door(data, again=True)
@@ -92,7 +96,7 @@ class Agent:
     def tick(self, now: float) -> list[Event]:
         """Let time pass: release what the pacing held back, fold, announce, repair."""
         events = self._issue(now)
-        events += self._advance()
+        events += self._advance(self.config.ledger.fold_per_tick)
         self._post(self.sync.tick(now))
         return events
 
@@ -130,13 +134,14 @@ class Agent:
         """Newest pose (4, 4) in this robot's component, and its stamp in s, by robot's name."""
         self._advance()
         here, found = self._component, {}
-        for author in self.consensus.authors.values():
+        for author in sorted(self.consensus.authors.values(), key=lambda author: author.id):
             if author.anchors:
                 anchor = author.anchors[max(author.anchors)]
                 component, pose = self.consensus.placement(author.id, anchor.session)
                 if component == here:
                     place = pose_matrix(pose) @ pose_matrix(anchor.pose)
-                    found[author.name or author.id.hex()] = (place, anchor.stamp / 1e6)
+                    name = author.name if author.name not in found else None  # names are free
+                    found[name or author.id.hex()] = (place, anchor.stamp / 1e6)
         return found
 
     @property
@@ -164,8 +169,9 @@ class Agent:
             data = seal(self.identity, self.config, len(main), previous, lamport, tips, payload)
             bundles = 0 if payload.bundle is None else len(payload.bundle.cores())
             events += self._through_the_door(data)
-            id_ = self.ledger.chain(me).main[-1].id
-            events.append(Issued(id_, payload.features, bundles, len(data)))
+            if id_of(data) not in self.ledger:
+                break  # a Rejected event above says why; numbering on would fork the chain
+            events.append(Issued(id_of(data), payload.features, bundles, len(data)))
             self._post([(Transactions((data,)), None)])
         return events
 
@@ -199,11 +205,11 @@ class Agent:
             tx.drop_columns()
         self._map = None
 
-    def _advance(self) -> list[Event]:
+    def _advance(self, budget: int | None = None) -> list[Event]:
         if not self.consensus.pending:
             return []
         self._map = None
-        return [MapChanged(*self.consensus.advance())]
+        return [MapChanged(*self.consensus.advance(budget))]
 
     def _post(self, posts: Iterable[Post]) -> None:
         me = self.identity.author

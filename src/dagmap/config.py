@@ -132,10 +132,12 @@ class LedgerConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     waiting_transactions: int = 4096  # the waiting room: transactions without their references
     waiting_bytes: int = 64 << 20
+    fold_per_tick: int = 100_000  # features that a tick folds at most; a read folds the rest
 
     def __post_init__(self) -> None:
         self._require_range("waiting_transactions", 1, 1 << 24)
         self._require_range("waiting_bytes", 1 << 16, 1 << 40)
+        self._require_range("fold_per_tick", 1, 1 << 40)
 
 
 class SyncConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):

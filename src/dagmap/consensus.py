@@ -23,6 +23,8 @@ from .model import AuthorId, FrameId, Int32s
 from .payload import Anchor
 from .transaction import Transaction
 
+MAX_LINKS = 256  # of one author, the first in its chain: bounds what placing frames costs
+
 
 @dataclass(slots=True)
 class Component:
@@ -101,7 +103,7 @@ class Consensus:
             contribution = self._contributions[self._order[len(self._applied)]]
             self._apply(contribution)
             applied += 1
-            work += len(contribution.xyz)
+            work += 1 + len(contribution.xyz)
         return undone, applied
 
     def placement(self, author: AuthorId, session: int) -> Placement:
@@ -165,8 +167,10 @@ class Consensus:
                 self._restale(author.seen_in.get(anchor.cycle, ()))
         self._restale(author.retract(tx.payload.retracted))
         for link in tx.payload.links:
-            if link.source.author == tx.author:  # a robot places its own frames only
-                author.links[link.source, link.target] = link
+            ends = (link.source, link.target)
+            room = ends in author.links or len(author.links) < MAX_LINKS
+            if link.source.author == tx.author and room:  # a robot places its own frames only
+                author.links[ends] = link
                 self._links_changed = True
         author.name = author.name if tx.payload.name is None else tx.payload.name
 

@@ -255,8 +255,10 @@ def _whole(body: Reader, read: Callable[[Reader], Int64s]) -> Int64s:
 
 
 def _decode_sighting(body: Reader) -> Sighting:
-    cycle = body.number(MAX_CYCLE)
-    return Sighting(cycle, _whole(body, _decode_ascending))
+    sighting = Sighting(body.number(MAX_CYCLE), _whole(body, _decode_ascending))
+    if len(sighting.numbers) == 0:
+        raise Refusal(Reason.MALFORMED, "sighting of nothing")
+    return sighting
 
 
 def _encode_link(link: Link) -> bytes:

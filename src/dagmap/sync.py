@@ -133,7 +133,7 @@ class Sync:
         while len(self._sent_at) > 64:
             self._sent_at.popitem(last=False)
         recent = list(self.peers.items())[-MAX_ECHOES:]
-        echoes = tuple((id_, p.token, round((now - p.heard) * 1e6)) for id_, p in recent)
+        echoes = tuple((id_, p.token, max(0, round((now - p.heard) * 1e6))) for id_, p in recent)
         for first in range(0, max(len(heads), 1), _MAX_HEADS):
             yield Heads(self._token, echoes, tuple(heads[first : first + _MAX_HEADS])), None
 
