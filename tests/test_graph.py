@@ -17,7 +17,7 @@ from dagmap.model import LIMIT_MM, CycleError
 from naive import MOST, NaiveDag, Point
 
 COMPILED = not numba.config.DISABLE_JIT
-SOME = settings(max_examples=150 if COMPILED else 15, deadline=None)
+SOME = settings(max_examples=150 if COMPILED else 60, deadline=None)
 SALT = 0x0123_4567_89AB_CDEF
 
 

@@ -59,7 +59,7 @@ class RayEvidence:
         key = hash_key(salt)
         top = np.concatenate([np.zeros(bricks.KEY, np.int64), key])
         top[bricks.FREE_BRICK : bricks.FREE_WIDE + 1] = -1
-        small = np.zeros((0, 64), np.int8)
+        small = np.zeros((16, 64), np.int8)
         self._bricks = bricks.Bricks(
             top=top,
             buckets=np.full(64, -1, np.int32),
@@ -108,9 +108,8 @@ class RayEvidence:
             return
         self._authors = max(self._authors, author + 1)
         origins, starts, xyz = plain(origins), plain(starts), plain(xyz)
-        alive, last = plain(alive), np.empty(len(xyz), np.int64)
-        cell, limit = self._cell, self._limit
-        while not rays.mark_rays(self._marks, cell, limit, origins, starts, xyz, alive, last):
+        alive, cell, limit = plain(alive), self._cell, self._limit
+        while not rays.list_cells(self._marks, cell, limit, origins, starts, xyz, alive):
             steps = 3 * (limit // cell + 2)  # of the longest ray
             rows, cells = len(self._marks.row) + steps // 8 + 4, len(self._marks.cell) + steps + 2
             self._marks = _marks(rows, cells, self._marks.top)
@@ -172,7 +171,7 @@ class RayEvidence:
 def _marks(rows: int, cells: int, top: Int64s) -> rays.Marks:
     """Room for half as many rows and cells again; nothing is marked."""
     rows, cells = rows + rows // 2, cells + cells // 2
-    bits = np.zeros(128 * rows, np.uint8)
+    bits = np.zeros(64 * rows, np.uint8)
     return rays.Marks(
         top=top,
         table=np.zeros(1 << (2 * rows).bit_length(), np.int32),
@@ -180,4 +179,5 @@ def _marks(rows: int, cells: int, top: Int64s) -> rays.Marks:
         bits=bits,
         word=bits.view(np.int64),
         cell=np.zeros(cells, np.int64),
+        block=np.zeros((rows, 16), np.int32),
     )

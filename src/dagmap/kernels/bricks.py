@@ -16,13 +16,12 @@ import numpy.typing as npt
 from ..model import Int32s, Int64s
 from .inner import inner
 from .leaf import leaf
-from .rays import BRICK, CELLS, ENTRY, ROWS, ZERO, ZEROED, Marks
+from .rays import BRICK, CELLS, ENDS, ENTRY, LOW, ROWS, TOUCHED, ZERO, ZEROED, Marks
 
 Int8s: TypeAlias = npt.NDArray[np.int8]
 
 # Keyed hash modulo a prime as in `matching` (repeated here: see the trap in `jit`).
 _P = (1 << 31) - 1
-_LOW = 1 << 29
 _NEVER = 1 << 62
 _FREED = -2  # in column FIRST: the brick waits in the list of free ones
 LAYERS = 8
@@ -47,9 +46,9 @@ class Bricks(NamedTuple):
 
 @inner
 def _bucket(top: Int64s, mask: int, x: int, y: int, z: int) -> int:
-    u = int(top[KEY]) * (x + _LOW)
-    v = int(top[KEY + 1]) * (y + _LOW)
-    w = int(top[KEY + 2]) * (z + _LOW)
+    u = int(top[KEY]) * (x + LOW)
+    v = int(top[KEY + 1]) * (y + LOW)
+    w = int(top[KEY + 2]) * (z + LOW)
     h = int(top[KEY + 3]) + (u & _P) + (u >> 31) + (v & _P) + (v >> 31) + (w & _P) + (w >> 31)
     h = (h & _P) + (h >> 31)
     return (h if h < _P else h - _P) & mask
@@ -143,49 +142,67 @@ def find_entries(bricks: Bricks, marks: Marks, author: int) -> bool:
         return False
     for r in range(rows):
         x, y, z = int(row[r, BRICK]), int(row[r, BRICK + 1]), int(row[r, BRICK + 2])
+        x, y, z = x - LOW, y - LOW, z - LOW
         b = _find(top, buckets, brick, x, y, z)
         if b < 0:
             b = _new_brick(top, buckets, brick, x, y, z)
         row[r, ENTRY] = _entry(top, brick, entry, b, author)
         row[r, ZERO] = 0
     marks.top[ZEROED] = 0
+    marks.top[TOUCHED] = _copy_blocks(entry, bricks.small, row, marks.word, marks.block, rows)
     return True
+
+
+@inner
+def _copy_blocks(
+    entry: Int32s, small: Int8s, row: Int32s, word: Int64s, block: Int32s, rows: int
+) -> int:
+    """Copy the entries' blocks to the marks; read where `add_cells` will write.
+
+    Here the processor waits for many lines of memory at once, there for one after another.
+    """
+    touched = 0
+    for r in range(rows):
+        e = int(row[r, ENTRY])
+        for layer in range(LAYERS):
+            c = int(entry[e, PASS + layer])
+            block[r, layer] = c
+            block[r, LAYERS + layer] = entry[e, END + layer]
+            touched |= int(small[max(c, 0) * int(word[r * LAYERS + layer] != 0), 0])
+    return touched
 
 
 @leaf
 def add_cells(bricks: Bricks, marks: Marks, sign: int, begin: int) -> int:
-    """Add `sign` to what is listed from `begin` on, but where a point ended only to its ends.
+    """Add `sign` to the counters of what is listed, from `begin` on.
 
-    Returns how many cells are listed, or the one before which blocks may run out.
+    Returns how many cells are listed, or the one before which blocks run out.
     """
     top, entry = bricks.top, bricks.entry
     small, word, wide = bricks.small, bricks.word, bricks.wide
-    row, bits, cells = marks.row, marks.bits, marks.cell
-    count = int(marks.top[CELLS])
+    row, cells, block = marks.row, marks.cell, marks.block
+    count, ends = int(marks.top[CELLS]), int(marks.top[ENDS])
     for i in range(begin, count):
         at = int(cells[i])
-        if at & 512 == 0 and (int(bits[(at >> 3) + 64]) >> (at & 7)) & 1 == 1:
-            continue
-        r = at >> 10
-        e = int(row[r, ENTRY])
-        column = PASS + ((at >> 6) & 15)
-        if int(top[SMALL]) >= small.shape[0] or int(top[WIDE]) >= wide.shape[0]:
-            return i
-        c = int(entry[e, column])
+        r, layer, at = at >> 9, (at >> 6 & 7) + (LAYERS if i < ends else 0), at & 63
+        c = int(block[r, layer])
         if c == NONE:
+            if int(top[SMALL]) >= small.shape[0]:
+                return i
             c = _new_small(top, word)
-            entry[e, column] = c
-        counter = sign + (int(small[c, at & 63]) if c >= 0 else int(wide[-2 - c, at & 63]))
+            block[r, layer] = entry[row[r, ENTRY], PASS + layer] = c
+        counter = sign + (int(small[c, at]) if c >= 0 else int(wide[-2 - c, at]))
         if c >= 0 and not -128 <= counter <= 127:
+            if int(top[WIDE]) >= wide.shape[0]:
+                return i
             c = _widen(top, small, word, wide, c)
-            entry[e, column] = c
+            block[r, layer] = entry[row[r, ENTRY], PASS + layer] = c
         if c >= 0:
-            small[c, at & 63] = counter
+            small[c, at] = counter
         else:
-            wide[-2 - c, at & 63] = counter
+            wide[-2 - c, at] = counter
         if counter == 0:
-            row[r, ZERO] = 1
-            marks.top[ZEROED] = 1
+            row[r, ZERO] = marks.top[ZEROED] = 1
     return count
 
 
@@ -256,7 +273,7 @@ def free_zeros(bricks: Bricks, marks: Marks) -> None:
             kept = kept or c != NONE
         if not kept:
             x, y, z = int(row[r, BRICK]), int(row[r, BRICK + 1]), int(row[r, BRICK + 2])
-            _drop(bricks, x, y, z, e)
+            _drop(bricks, x - LOW, y - LOW, z - LOW, e)
 
 
 @leaf

@@ -42,7 +42,7 @@ def _attach(
     nodes: Int32s, pool: Int32s, table: Int32s, best: Int64s, numbers: Int64s,
     node: int, place: int, j: int,
 ) -> None:  # fmt: skip
-    """Alg. 1, l. 3 to 9: the j-th of the last search becomes the parent of `node` at `place`."""
+    """Alg. 1, l. 2 to 8: the j-th of the last search becomes the parent of `node` at `place`."""
     row = best[j, CELL]
     if best[j, RANK] < LATTICE:
         parent = best[j, RANK]

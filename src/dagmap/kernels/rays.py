@@ -1,6 +1,6 @@
 """Section 4.3, preset `default`: which cells a transaction's rays cross, in integers.
 
-One call marks cells in bits of its own (`Marks`) and lists each cell once; `bricks` then adds what
+One call marks cells in bits of its own (`Marks`), so that it lists each once; `bricks` then adds what
 is listed to the counters of the map. Rows of the marks are bricks of 8^3 cells.
 
 The walk (Amanatides and Woo, 1987) compares the times of the next crossings t = n/|d| of the three
@@ -19,11 +19,13 @@ from .leaf import leaf
 
 # Keyed hash modulo a prime as in `matching` (repeated here: see the trap in `jit`).
 _P = (1 << 31) - 1
-_LOW = 1 << 29
+LOW = 1 << 29  # added to what is hashed: no negative numbers
 _NEVER = 1 << 61
-ROWS, CELLS, ZEROED, KEY = 0, 1, 2, 3  # places in Marks.top
+# Places in Marks.top: rows in use, cells listed, how many of them are ends; for `bricks`, whether
+# any counter became zero, and a number that nobody reads; key of the hash.
+ROWS, CELLS, ENDS, ZEROED, TOUCHED, KEY = range(6)
 BRICK, SLOT, ENTRY, ZERO = 6, 9, 10, 11  # columns of Marks.row after the neighbours
-# A place on a ray: below, the number of a bit; above, three counters of the steps that are left in
+# A place on a ray: below, the number of a cell's bit; above, three counters of the steps that are left in
 # the brick along x, y, z, 8 bits each. Below zero a counter borrows, which sets its highest bit.
 _LEFT = 40
 _AT = (1 << _LEFT) - 1
@@ -33,21 +35,21 @@ _BORROWED = 0x808080 << _LEFT
 class Marks(NamedTuple):
     """What one call marks."""
 
-    top: Int64s  # (7,) rows in use, cells listed, (`bricks`) any zero?, key of the hash
+    top: Int64s  # (9,) see above
     table: Int32s  # (T,) rows by hash of the brick; T a power of two, at least twice R
-    row: Int32s  # (R, 12) rows at -x +x -y +y -z +z or -1; brick x y z; slot; for `bricks`: entry,
-    # whether a counter became zero
-    bits: Uint8s  # (R * 128,) bit z * 64 + y * 8 + x of a row: passed; 512 bits on: ended
-    word: Int64s  # (R * 16,) the same memory
-    cell: Int64s  # (L,) the cells: number of the bit
+    row: Int32s  # (R, 12) rows at -x +x -y +y -z +z or -1; brick x y z, each + LOW; slot; for
+    # `bricks`: entry, whether a counter became zero
+    bits: Uint8s  # (R * 64,) bit z * 64 + y * 8 + x of a row: listed
+    word: Int64s  # (R * 8,) the same memory
+    cell: Int64s  # (L,) numbers of the bits, first of the cells where points end, then of others
+    block: Int32s  # (R, 16) for `bricks`
 
 
 @inner
 def _enter(top: Int64s, table: Int32s, row: Int32s, word: Int64s, x: int, y: int, z: int) -> int:
     """Row of a brick, an empty one where the call has none yet."""
-    u = int(top[KEY]) * (x + _LOW)
-    v = int(top[KEY + 1]) * (y + _LOW)
-    w = int(top[KEY + 2]) * (z + _LOW)
+    x, y, z = x + LOW, y + LOW, z + LOW
+    u, v, w = int(top[KEY]) * x, int(top[KEY + 1]) * y, int(top[KEY + 2]) * z
     h = int(top[KEY + 3]) + (u & _P) + (u >> 31) + (v & _P) + (v >> 31) + (w & _P) + (w >> 31)
     h = (h & _P) + (h >> 31)
     slot = (h if h < _P else h - _P) & (table.shape[0] - 1)
@@ -66,7 +68,7 @@ def _enter(top: Int64s, table: Int32s, row: Int32s, word: Int64s, x: int, y: int
     row[rows, BRICK + 1] = y
     row[rows, BRICK + 2] = z
     row[rows, SLOT] = slot
-    for i in range(rows * 16, rows * 16 + 16):
+    for i in range(rows * 8, rows * 8 + 8):
         word[i] = 0
     return rows
 
@@ -129,15 +131,11 @@ def _walk(
     k: int,
     xyz: Int32s,
     alive: Bools,
-    last: Int64s,
     begin: int,
     end: int,
 ) -> bool:
-    """Mark the cells from origin k to the points begin to end - 1, both ends included.
-
-    last (n,) gets the bit that a ray marks last, -1 where the ray was cut. False: too little room.
-    """
-    top, table, row, bits, word, cells = marks
+    """List the cells from origin k to the points begin to end - 1. False: too little room."""
+    top, table, row, bits, word, cells, _ = marks
     ox, oy, oz = int(origins[k, 0]), int(origins[k, 1]), int(origins[k, 2])
     cx, cy, cz = ox // cell, oy // cell, oz // cell
     for i in range(begin, end):
@@ -159,7 +157,7 @@ def _walk(
         kx, ky, kz = gx - (1 << _LEFT), 8 * gy - (256 << _LEFT), 64 * gz - (65536 << _LEFT)
         bx, by, bz = cx >> 3, cy >> 3, cz >> 3
         r = _enter(top, table, row, word, bx, by, bz)
-        at = (r << 10) | (cz & 7) << 6 | (cy & 7) << 3 | (cx & 7)
+        at = (r << 9) | (cz & 7) << 6 | (cy & 7) << 3 | (cx & 7)
         count = _mark(bits, cells, count, at)
         left = (cx ^ 7 if dx > 0 else cx) & 7 | ((cy ^ 7 if dy > 0 else cy) & 7) << 8
         at += (left | ((cz ^ 7 if dz > 0 else cz) & 7) << 16) << _LEFT
@@ -172,7 +170,7 @@ def _walk(
             ty += (y & uy) - (x & ux)
             tz += (z & uz) - (x & ux)
             if at & _BORROWED:
-                at -= 8 * stride + (r << 10)  # in at the other side
+                at -= 8 * stride + (r << 9)  # in at the other side
                 bx, by, bz = bx + (x & gx), by + (y & gy), bz + (z & gz)
                 side = (y & 2) + (z & 4) + (((x & gx) + (y & gy) + (z & gz) + 1) >> 1)
                 beyond = int(row[r, side])
@@ -181,34 +179,32 @@ def _walk(
                     row[r, side] = beyond
                     row[beyond, side ^ 1] = r
                 r = beyond
-                at += r << 10
+                at += r << 9
             count = _mark(bits, cells, count, at & _AT)
         top[CELLS] = count
-        whole = ox + dx == xyz[i, 0] and oy + dy == xyz[i, 1] and oz + dz == xyz[i, 2]
-        last[i] = at & _AT if whole else -1
     return True
 
 
 @inner
-def _mark_ends(marks: Marks, cell: int, xyz: Int32s, alive: Bools, last: Int64s) -> bool:
-    """Mark the cells in which points end; `last` where it is known. False: too little room."""
-    top, table, row, bits, word, cells = marks
+def _list_ends(marks: Marks, cell: int, xyz: Int32s, alive: Bools) -> bool:
+    """List the cells in which points end. False: too little room."""
+    top, table, row, bits, word, cells, _ = marks
     for i in range(xyz.shape[0]):
         if not alive[i]:
             continue
-        count, at = int(top[CELLS]), int(last[i])
+        count = int(top[CELLS])
         if int(top[ROWS]) >= row.shape[0] or count + 1 >= cells.shape[0]:
             return False
-        if at < 0:
-            cx, cy, cz = int(xyz[i, 0]) // cell, int(xyz[i, 1]) // cell, int(xyz[i, 2]) // cell
-            r = _enter(top, table, row, word, cx >> 3, cy >> 3, cz >> 3)
-            at = (r << 10) | (cz & 7) << 6 | (cy & 7) << 3 | (cx & 7)
-        top[CELLS] = _mark(bits, cells, count, at + 512)
+        cx, cy, cz = int(xyz[i, 0]) // cell, int(xyz[i, 1]) // cell, int(xyz[i, 2]) // cell
+        r = _enter(top, table, row, word, cx >> 3, cy >> 3, cz >> 3)
+        at = (r << 9) | (cz & 7) << 6 | (cy & 7) << 3 | (cx & 7)
+        top[CELLS] = _mark(bits, cells, count, at)
+    top[ENDS] = top[CELLS]
     return True
 
 
 @leaf
-def mark_rays(
+def list_cells(
     marks: Marks,
     cell: int,
     limit: int,
@@ -216,20 +212,19 @@ def mark_rays(
     starts: Int64s,
     xyz: Int32s,
     alive: Bools,
-    last: Int64s,
 ) -> bool:
-    """Mark what the rays of n points cross, and where the points end; what was marked is forgotten.
+    """List once each the cells where points end, then those that rays cross and no point ends in.
 
-    origins (s, 3), starts (s + 1,): see `evidence`. `limit` 0 walks no rays. `last` (n,) is room to
-    work in. False: there is too little room; give it more and call again.
+    origins (s, 3), starts (s + 1,): see `evidence`. `limit` 0 walks no rays. What was listed before is
+    forgotten. False: there is too little room; give it more and call again.
     """
     marks.top[ROWS] = 0
     marks.top[CELLS] = 0
-    for i in range(xyz.shape[0]):
-        last[i] = -1
+    if not _list_ends(marks, cell, xyz, alive):
+        return False
     if limit > 0:
         for k in range(origins.shape[0]):
             begin, end = int(starts[k]), int(starts[k + 1])
-            if not _walk(marks, cell, limit, origins, k, xyz, alive, last, begin, end):
+            if not _walk(marks, cell, limit, origins, k, xyz, alive, begin, end):
                 return False
-    return _mark_ends(marks, cell, xyz, alive, last)
+    return True
