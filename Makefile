@@ -21,6 +21,8 @@ LOCAL := --no-deps --no-build-isolation --force-reinstall
 COMPILE := $(LOCK)/bin/uv pip compile --quiet --upgrade --universal --python-version 3.10 \
   --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate \
   --custom-compile-command 'make lock' pyproject.toml requirements/build.in
+# Tests that compare kernels with their slow twins; they must also pass as plain Python.
+TWINS := tests/test_graph.py tests/test_fold.py tests/test_codec.py tests/test_frames.py
 OFFICE := examples/office/robot1 examples/office/robot2 examples/office/robot3
 
 # A sourced ROS workspace sets PYTHONPATH; its packages must not mix with those of the environments.
@@ -33,6 +35,7 @@ demo: $(DEMO)/.package
 	@$(DEMO)/bin/dagmap replay $(OFFICE) --out out/office --force
 
 test: check
+	NUMBA_DISABLE_JIT=1 $(TEST)/bin/python -m pytest -q -n 2 $(TWINS)
 	$(TEST)/bin/python -m pytest -n 2
 
 check: $(TEST)/.package

@@ -7,13 +7,18 @@ runs; every rate stands beside a cKDTree of the same points built in the same ru
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
-from dagmap.fold import Block
+from dagmap.config import FoldConfig
+from dagmap.evidence import RayEvidence
+from dagmap.fold import Block, DefaultFold
 from dagmap.model import Int32s
 
 POINTS = 250  # of a block
@@ -113,3 +118,81 @@ def _block(robot: int, number: int, points: Int32s, rng: np.random.Generator) ->
         sightings=np.zeros(0, np.int64),
         sighting_cycle=np.zeros(0, np.int32),
     )
+
+
+def _clock(step: Callable[[], object]) -> float:
+    started = time.process_time()
+    step()
+    return time.process_time() - started
+
+
+def _rates(site: Site, max_ray: float, cycles: int) -> list[dict[str, Any]]:
+    """Association, rays, undo and reading of one site."""
+    config = FoldConfig(max_ray=max_ray)
+    seen = scans(site, cycles)
+    points = sum(len(scan.block.xyz) for scan in seen)
+    starts = [np.array([0, len(scan.block.xyz)], np.int64) for scan in seen]
+    fold, rays = DefaultFold(config), RayEvidence(config.cell_mm, config.max_ray_mm)
+
+    def associate() -> None:
+        for scan in seen:
+            fold.apply(scan.block)
+
+    def walk() -> None:
+        for scan, start in zip(seen, starts, strict=True):
+            block = scan.block
+            rays.walk(block.author, scan.origin, start, block.xyz, block.alive, +1)
+
+    def undo() -> None:
+        for scan in reversed(seen):
+            fold.undo(scan.block)
+
+    apply_s, walk_s, undo_s, redo_s = (_clock(s) for s in (associate, walk, undo, associate))
+    read_s = _clock(lambda: fold.evaluate(rays))
+    cloud = np.concatenate([scan.block.xyz for scan in seen])
+    tree_s = _clock(lambda: cKDTree(cloud))
+    nodes = len(fold)
+    rows: list[dict[str, Any]] = [
+        {"name": f"{site.name}: fold with rays", "rate": points / (apply_s + walk_s)},
+        {"name": f"{site.name}: association alone", "rate": points / apply_s},
+        {
+            "name": f"{site.name}: undo and redo",
+            "to_plain_association": (undo_s + redo_s) / apply_s,
+        },
+        {"name": f"{site.name}: reading the states", "rate": nodes / read_s},
+        {
+            "name": f"{site.name}: memory",
+            "nodes": nodes,
+            "fold_bytes_a_node": fold.nbytes / nodes,
+            "rays_bytes_a_node_and_author": rays.nbytes / nodes / ROBOTS,
+        },
+    ]
+    for row in rows:
+        row["points"] = points
+        if "rate" in row:
+            row["to_ckdtree"] = row["rate"] / (points / tree_s)
+    return rows + _octomap(site, seen, max_ray)
+
+
+def _octomap(site: Site, seen: list[Scan], max_ray: float) -> list[dict[str, Any]]:
+    """The same scans into an OctoMap of the same cells, where pyoctomap installs."""
+    try:
+        import pyoctomap
+    except ImportError:
+        return []
+    tree = pyoctomap.OcTree(0.1)
+    part = seen[: len(seen) // 10]
+
+    def insert() -> None:
+        for scan in part:
+            origin = scan.origin[0] / 1000.0
+            tree.insertPointCloud(scan.block.xyz / 1000.0, origin, max_ray)
+
+    points = sum(len(scan.block.xyz) for scan in part)
+    return [{"name": f"{site.name}: pyoctomap", "points": points, "rate": points / _clock(insert)}]
+
+
+def run(cycles: int = 2000) -> list[dict[str, Any]]:
+    """Rows: rates in points/s of the processor's time, bytes, and ratios."""
+    _rates(ROOM, 4.0, 20)  # compiled and warm
+    return _rates(ROOM, 4.0, cycles) + _rates(HALL, 20.0, cycles)

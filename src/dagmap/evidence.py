@@ -179,5 +179,5 @@ def _marks(rows: int, cells: int, top: Int64s) -> rays.Marks:
         bits=bits,
         word=bits.view(np.int64),
         cell=np.zeros(cells, np.int64),
-        block=np.zeros((rows, 16), np.int32),
+        block=np.zeros((rows, 8), np.int32),
     )

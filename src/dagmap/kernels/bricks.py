@@ -157,7 +157,7 @@ def find_entries(bricks: Bricks, marks: Marks, author: int) -> bool:
 def _copy_blocks(
     entry: Int32s, small: Int8s, row: Int32s, word: Int64s, block: Int32s, rows: int
 ) -> int:
-    """Copy the entries' blocks to the marks; read where `add_cells` will write.
+    """Copy the entries' `pass` blocks to the marks; read where `add_cells` will write.
 
     Here the processor waits for many lines of memory at once, there for one after another.
     """
@@ -167,7 +167,6 @@ def _copy_blocks(
         for layer in range(LAYERS):
             c = int(entry[e, PASS + layer])
             block[r, layer] = c
-            block[r, LAYERS + layer] = entry[e, END + layer]
             touched |= int(small[max(c, 0) * int(word[r * LAYERS + layer] != 0), 0])
     return touched
 
@@ -184,19 +183,22 @@ def add_cells(bricks: Bricks, marks: Marks, sign: int, begin: int) -> int:
     count, ends = int(marks.top[CELLS]), int(marks.top[ENDS])
     for i in range(begin, count):
         at = int(cells[i])
-        r, layer, at = at >> 9, (at >> 6 & 7) + (LAYERS if i < ends else 0), at & 63
-        c = int(block[r, layer])
+        r, layer, at = at >> 9, at >> 6 & 7, at & 63
+        e = int(row[r, ENTRY])
+        c = int(entry[e, END + layer]) if i < ends else int(block[r, layer])
         if c == NONE:
             if int(top[SMALL]) >= small.shape[0]:
                 return i
             c = _new_small(top, word)
-            block[r, layer] = entry[row[r, ENTRY], PASS + layer] = c
+            entry[e, (END if i < ends else PASS) + layer] = c
+            block[r, layer] = entry[e, PASS + layer]
         counter = sign + (int(small[c, at]) if c >= 0 else int(wide[-2 - c, at]))
         if c >= 0 and not -128 <= counter <= 127:
             if int(top[WIDE]) >= wide.shape[0]:
                 return i
             c = _widen(top, small, word, wide, c)
-            block[r, layer] = entry[row[r, ENTRY], PASS + layer] = c
+            entry[e, (END if i < ends else PASS) + layer] = c
+            block[r, layer] = entry[e, PASS + layer]
         if c >= 0:
             small[c, at] = counter
         else:

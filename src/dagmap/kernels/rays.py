@@ -1,6 +1,6 @@
 """Section 4.3, preset `default`: which cells a transaction's rays cross, in integers.
 
-One call marks cells in bits of its own (`Marks`), so that it lists each once; `bricks` then adds what
+One call marks cells in bits of its own (`Marks`) to list each once; `bricks` then adds what
 is listed to the counters of the map. Rows of the marks are bricks of 8^3 cells.
 
 The walk (Amanatides and Woo, 1987) compares the times of the next crossings t = n/|d| of the three
@@ -25,8 +25,8 @@ _NEVER = 1 << 61
 # any counter became zero, and a number that nobody reads; key of the hash.
 ROWS, CELLS, ENDS, ZEROED, TOUCHED, KEY = range(6)
 BRICK, SLOT, ENTRY, ZERO = 6, 9, 10, 11  # columns of Marks.row after the neighbours
-# A place on a ray: below, the number of a cell's bit; above, three counters of the steps that are left in
-# the brick along x, y, z, 8 bits each. Below zero a counter borrows, which sets its highest bit.
+# A place on a ray: below, the number of a cell's bit; above, three counters of the steps that are
+# left in the brick along x, y, z, 8 bits each. Below zero one borrows: that sets its highest bit.
 _LEFT = 40
 _AT = (1 << _LEFT) - 1
 _BORROWED = 0x808080 << _LEFT
@@ -42,7 +42,7 @@ class Marks(NamedTuple):
     bits: Uint8s  # (R * 64,) bit z * 64 + y * 8 + x of a row: listed
     word: Int64s  # (R * 8,) the same memory
     cell: Int64s  # (L,) numbers of the bits, first of the cells where points end, then of others
-    block: Int32s  # (R, 16) for `bricks`
+    block: Int32s  # (R, 8) for `bricks`
 
 
 @inner
@@ -215,7 +215,7 @@ def list_cells(
 ) -> bool:
     """List once each the cells where points end, then those that rays cross and no point ends in.
 
-    origins (s, 3), starts (s + 1,): see `evidence`. `limit` 0 walks no rays. What was listed before is
+    origins (s, 3), starts (s + 1,): see `evidence`. `limit` 0 walks no rays. An earlier list is
     forgotten. False: there is too little room; give it more and call again.
     """
     marks.top[ROWS] = 0
