@@ -15,8 +15,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from ..model import Bools, Int32s, Int64s, Uint8s
-from .inner import inner
-from .leaf import leaf
+from .jit import inner, leaf
 
 NODES, ENTRIES, SERIAL = 0, 1, 2  # places in Graph.sizes
 AUTHOR, SEEN, NEXT = 0, 1, 2  # columns of Graph.entries

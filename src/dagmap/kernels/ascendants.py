@@ -6,8 +6,7 @@ The columns of `nodes` are described in `lattice`.
 from __future__ import annotations
 
 from ..model import Int32s, Int64s
-from .inner import inner
-from .jit import kernel
+from .jit import inner, kernel
 from .lattice import CHILD, FLAGS, ISSUED, MARKED, PARENTS, WITHDRAWN, wide
 
 SATURATED = (1 << 63) - 1

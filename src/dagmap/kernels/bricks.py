@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..model import Int32s, Int64s
-from .inner import inner
-from .leaf import leaf
+from .jit import inner, leaf
 from .rays import BRICK, CELLS, ENDS, ENTRY, LOW, ROWS, TOUCHED, ZERO, ZEROED, Marks
 
 Int8s: TypeAlias = npt.NDArray[np.int8]

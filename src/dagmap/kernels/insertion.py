@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from ..model import Int32s, Int64s
 from .ascendants import valid
-from .inner import inner
-from .jit import kernel
+from .jit import inner, kernel
 from .lattice import (
     CELL,
     CHILD,

@@ -16,8 +16,7 @@ from typing import Any, cast
 import numpy as np
 
 from ..model import Int32s, Int64s
-from .inner import inner
-from .jit import kernel
+from .jit import inner, kernel
 
 LEAF = 6  # a list of terminals longer than this is split in eight
 LAST_LEVEL = -11  # level L > 0: a box of 2^L mm; 0 to -11: one point, ever finer ranges of ids

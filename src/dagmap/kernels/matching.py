@@ -11,8 +11,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from ..model import Bools, Int32s, Int64s, Uint8s
-from .inner import inner
-from .leaf import leaf
+from .jit import inner, leaf
 
 # Hashes are a x + b y + c z + d modulo the prime p with secret a, b, c, d: whatever coordinates
 # somebody chooses, two of them collide with probability 1/p (Carter and Wegman, 1979).

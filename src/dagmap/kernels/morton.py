@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..model import Int32s, Int64s
-from .leaf import leaf
+from .jit import leaf
 
 
 @leaf

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..model import LIMIT_MM, Int32s, Int64s, Uint8s
-from .leaf import leaf
+from .jit import leaf
 
 MAX_SLOTS = 8  # parents of a feature, at most
 _LIMIT = LIMIT_MM

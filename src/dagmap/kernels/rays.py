@@ -14,8 +14,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from ..model import Bools, Int32s, Int64s, Uint8s
-from .inner import inner
-from .leaf import leaf
+from .jit import inner, leaf
 
 # Keyed hash modulo a prime as in `matching` (repeated here: see the trap in `jit`).
 _P = (1 << 31) - 1
