@@ -127,7 +127,8 @@ def test_previous_among_the_references_does_not_raise():
     )  # its own previous, twice
     agent = Agent(identity("me"), CONFIG)
     rx(agent, b)  # waits for a, twice
-    rx(agent, a)  # KeyError escapes Agent.receive
+    rx(agent, a)  # a KeyError escaped Agent.receive
+    assert a.id in agent.ledger and b.id not in agent.ledger
 
 
 def test_too_many_children_on_a_branch_is_judged_alike():
@@ -208,6 +209,8 @@ def test_ids_that_a_move_threw_out_can_be_removed():
     agent.observe(Cycle(0.0, np.eye(4), [[300000.0, 0, 0], [9, 0, 0]], ids=[1, 2]), 0.0)
     agent.observe(Cycle(1.0, np.eye(4), EMPTY, moved=moved(0.0, x=400000.0)), 1.0)
     agent.observe(Cycle(2.0, np.eye(4), EMPTY, removed=[1]), 2.0)
+    with pytest.raises(CycleError, match="removed before"):
+        agent.observe(Cycle(3.0, np.eye(4), EMPTY, removed=[1]), 3.0)
 
 
 def test_a_restored_robot_can_move_its_earlier_cycles():
