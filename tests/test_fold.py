@@ -175,6 +175,30 @@ def test_undo_is_the_exact_inverse(
 
 
 @BOTH
+def test_many_nodes(config: FoldConfig) -> None:
+    """Buckets and columns grow, also between undo and redo."""
+    rng = np.random.default_rng(5)
+    blocks = []
+    for k in range(6):
+        parents = rng.integers(-1, 60 * (k // 2) + np.arange(60)[:, None] + 1, (60, 2)) - 1
+        where = rng.integers(-300, 300, (60, 3))
+        blocks.append(block(k % 2, 60 * (k // 2), where, parents=parents, cores=range(9, 60, 10)))
+    fold = applied(config, blocks[:2])
+    states = [state_of(fold)]
+    for one in blocks[2:]:
+        fold.apply(one)
+        states.append(state_of(fold))
+    assert_same(config, fold, blocks)
+    for one in blocks[:1:-1]:
+        assert state_of(fold) == states.pop()
+        fold.undo(one)
+    assert state_of(fold) == states[0]
+    for one in blocks[2:]:
+        fold.apply(one)
+    assert_same(config, fold, blocks)
+
+
+@BOTH
 @FEW
 @given(blocks=stories(most=6))
 def test_nothing_depends_on_salt_or_numbering(config: FoldConfig, blocks: list[Block]) -> None:
@@ -232,6 +256,8 @@ def test_support_that_ends_in_the_cell_counts_against_the_own_misses() -> None:
     assert fold.evaluate(rays).misses.tolist() == [1]
     walk(rays, 0, [(-150, 10, 10)], [0, 2], [(250, 10, 10), (30, 30, 30)])  # one transaction: ended
     assert fold.evaluate(rays).misses.tolist() == [0]
+    walk(rays, 0, [(-150, 10, 10)], [0, 1], [(20, 20, 20)])
+    assert fold.evaluate(rays).misses.tolist() == [0]  # ended more often than passed
 
 
 @BOTH
@@ -309,6 +335,14 @@ def test_algorithm_2_where_the_nearest_node_has_no_ascendants() -> None:
     blocks.append(block(1, 0, [(0, 0, 9), (0, 0, 1)], parents=[[-1], [0]], cores=[1]))
     verdict = applied(PAPER, blocks).evaluate(no_rays())
     assert verdicts(verdict) == [(0, 0, 1, State.REJECTED)] * 3  # added, neither hit nor miss
+
+
+def test_algorithm_2_wants_less_than_delta() -> None:
+    def pair(author: int, y: int) -> Block:
+        return block(author, 0, [(0, y, 0), (500, y, 0)], parents=[[-1], [0]], cores=[1])
+
+    for y, nodes in ((49, 2), (50, 4)):
+        assert len(applied(PAPER, [pair(0, 0), pair(1, y)])) == nodes
 
 
 @SOME
@@ -434,6 +468,28 @@ def test_freed_memory_is_used_again() -> None:
     assert rays.nbytes < 2 * held
 
 
+def test_growth_at_any_point_and_after_bricks_were_freed() -> None:
+    rng = np.random.default_rng(11)
+
+    def call(author: int, rays: int, reach: int) -> Any:
+        ends = rng.integers(-reach, reach, (rays, 3))
+        return author, [(50, -50, 50)], [0, rays], points(ends), [True] * rays
+
+    kept, gone = call(0, 2, 4000), call(1, 6, 4000)
+    for count in (3, 9, 14, 20) if COMPILED else (3, 9):
+        rays, twin = RayEvidence(100, 9_000, count), NaiveRays(100, 9_000)
+        walk(rays, *gone)
+        many = call(2, count, 9000)
+        for here in (kept, many):
+            walk(rays, *here)
+            walk(twin, *here)
+        walk(rays, *gone, sign=-1)
+        for here in (call(2, 2 * count, 9000), gone, many):
+            walk(rays, *here)
+            walk(twin, *here)
+        assert_same_rays(rays, twin, [])
+
+
 def test_counters_beyond_a_byte() -> None:
     rays = RayEvidence(100, 1000)
     call = (1, [(50, 50, 50)], [0, 1], [(350, 50, 50)])
@@ -457,7 +513,8 @@ def test_rays_from_edge_to_edge(edge: int) -> None:
     """Cut after 100 m, in the finest and in coarse cells; nothing overflows."""
     for cell, limit in ((100, 100_000), (25, 100_000), (10_000, 100_000)):
         rays, twin = RayEvidence(cell, limit), NaiveRays(cell, limit)
-        for end in ((-edge, -edge, -edge), (-edge, edge, 1), (edge, edge - 7, edge)):
+        straight = ((-edge, edge, edge), (edge, -edge, edge), (edge, edge, -edge))
+        for end in ((-edge, -edge, -edge), (-edge, edge, 1), (edge, edge - 7, edge), *straight):
             call = (0, [(edge, edge, edge)], [0, 1], [end])
             walk(rays, *call)
             walk(twin, *call)
