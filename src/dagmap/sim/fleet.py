@@ -19,7 +19,7 @@ import msgspec
 from ..agent import Agent, Parsers
 from ..config import Config
 from ..identity import Identity
-from ..model import Accepted, AuthorId, Cycle, DagmapError, Event, Issued
+from ..model import Accepted, AuthorId, ConfigError, Cycle, DagmapError, Event, Issued
 from .network import Link, Network
 from .robot import (
     Clock,
@@ -42,14 +42,20 @@ Watch: TypeAlias = Callable[[Robot, Happening], None]
 Check: TypeAlias = Callable[[Robot], None]
 
 
-@dataclass(frozen=True, slots=True)
-class Crash:
-    """A robot's process dies at `at` (s) and is back `down` seconds later."""
+class Crash(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A robot's process dies at `at` (s) and is back `down` seconds later.
+
+    moment: "between" two steps; in the next step before the disk was synced; or after, "unsent".
+    """
 
     robot: str
     at: float
     down: float = 1.0
     moment: Moment = "between"
+
+    def __post_init__(self) -> None:
+        if not (self.at >= 0 and self.down >= 0):
+            raise ConfigError(f"crash at {self.at} s for {self.down} s: times of at least 0")
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +120,7 @@ class Fleet:
     def play(self, name: str, source: Source) -> None:
         """Feed a robot from a source from now on, again after each restart."""
         robot = self.robots[name]
-        robot.source, robot.stream = source, source.cycles(self.now)
+        robot.source, robot.stream = source, source.cycles(self.now, robot.session)
         self._plan_cycle(robot)
 
     def crash(self, crash: Crash) -> None:

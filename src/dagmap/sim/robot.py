@@ -55,8 +55,8 @@ class Disk:
 class Source(Protocol):
     """What a robot's SLAM sees. After a crash it starts anew, in the frame of before."""
 
-    def cycles(self, start: float) -> Iterator[Timed]:
-        """Cycles from a simulated time on, in order of time."""
+    def cycles(self, start: float, session: int) -> Iterator[Timed]:
+        """Cycles from a simulated time on, in order of time, by the SLAM's n-th start."""
         ...
 
 
@@ -67,7 +67,7 @@ class Recording:
         self._cycles = iter(cycles)
         self._offset: float | None = None
 
-    def cycles(self, start: float) -> Iterator[Timed]:
+    def cycles(self, start: float, session: int) -> Iterator[Timed]:
         for cycle in self._cycles:
             if self._offset is None:
                 self._offset = start - float(cycle.stamp)
@@ -163,7 +163,7 @@ class Robot:
         self.session += 1
         self._ids, self._stamps = set(), set()
         if self.source is not None:
-            self.stream = self.source.cycles(now)
+            self.stream = self.source.cycles(now, self.session)
 
     def perceived(self, cycle: Cycle) -> Cycle:
         """The cycle as this robot's clock stamps it, in the session that its SLAM is in.
