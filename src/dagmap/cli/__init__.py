@@ -63,6 +63,27 @@ def replay(
 
 
 @app.command()
+def evaluate(
+    map: Annotated[Path, typer.Argument(help="The map: PLY or NPZ.")],  # noqa: A002
+    reference: Annotated[Path, typer.Option(help="What is true: PLY or NPZ, in the same frame.")],
+    recall_reference: Annotated[
+        Path | None, typer.Option(help="What the map should hold; default: the reference.")
+    ] = None,
+    states: Annotated[
+        str, typer.Option(help="Which nodes count, where the map tells: names with commas.")
+    ] = "confirmed,tentative",
+    picture: Annotated[
+        Path | None, typer.Option(help="PNG of the map, coloured by its error.")
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Measure a map against a reference: accuracy, completeness, F-scores, entropy and more."""
+    from .evaluate import Evaluate
+
+    Evaluate(map, reference, recall_reference, states, picture, json).run()
+
+
+@app.command()
 def bench(
     names: Annotated[
         list[str] | None, typer.Argument(help="Which ones, by file name; default: all.")
