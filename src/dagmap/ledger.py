@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,6 +47,14 @@ class Outcome:
     missing: tuple[TransactionId, ...] | None = None  # the transaction waits for these
 
 
+class Sizes(NamedTuple):
+    """What a ledger holds."""
+
+    accepted: int
+    waiting: int
+    waiting_bytes: int
+
+
 class Ledger:
     """The transactions that a robot holds. `add` is the only way in."""
 
@@ -71,6 +80,9 @@ class Ledger:
     def __iter__(self) -> Iterator[Transaction]:
         """All accepted transactions, each after everything that it refers to."""
         return iter(self._known.values())
+
+    def sizes(self) -> Sizes:
+        return Sizes(len(self._known), len(self._waiting), self._waiting_size)
 
     def holds(self, id_: TransactionId) -> bool:
         """Whether it is accepted or waiting, so that it need not be looked at again."""

@@ -214,9 +214,8 @@ class Braggart(Honest):
         )
         invented = Head(self.random.randbytes(8), self.random.randrange(1, 99), bytes(8))
         boast = Heads(self.random.randrange(1 << 30), (), (*heads, invented))
-        return outgoing + [
-            Outgoing(messages.encode(boast, agent.config, agent.identity.author), None)
-        ]
+        data = messages.encode(boast, agent.config, agent.identity.author)
+        return [*outgoing, Outgoing(data)]
 
 
 LIARS: dict[str, type[Honest]] = {

@@ -10,6 +10,7 @@ from typing import TypeAlias
 import msgspec
 
 from ..model import Cycle, Rejected, State
+from ..worldmap import WorldMap
 from .fleet import Check, Fleet
 from .liars import make_liar
 from .network import Network, Position
@@ -81,9 +82,7 @@ class Mission:
         if not self._recordings:
             self._scene = self._build_scene()
         network = Network(scenario.link, seed, self.scenario.partitions, self._where)
-        self.fleet = Fleet(
-            scenario.config, network, self._note, check=check, tick=scenario.tick
-        )
+        self.fleet = Fleet(scenario.config, network, self._note, check=check, tick=scenario.tick)
         self._network = network
         self._divergence: list[tuple[float, float]] = []
         self._set_up()
@@ -94,19 +93,25 @@ class Mission:
 
     def run(self, told: Told | None = None) -> Report:
         """Play the mission, let the fleet agree, measure. `told` hears how far the time is."""
-        started, scenario = time.perf_counter(), self.scenario
-        joining = dict(self._joining())
+        started = time.perf_counter()
+        took = self.play(told)
+        return self._report(took, time.perf_counter() - started)
+
+    def play(self, told: Told | None = None) -> float | None:
+        """Play the mission and let the fleet agree.
+
+        Returns how long that took after the last cycle, s; None where it has not.
+        """
+        scenario, joining = self.scenario, dict(self._joining())
         while self.fleet.now < scenario.seconds:
-            following = min([at for at in joining.values()] or [scenario.seconds])
+            following = min(joining.values(), default=scenario.seconds)
             self._pass(min(self.fleet.now + SAMPLE, following, scenario.seconds), told)
             for name in [name for name, at in joining.items() if at <= self.fleet.now]:
                 self._join(name)
                 del joining[name]
-        ended, ideal = self.fleet.now, self._ideal()
-        while not self._quiet() and self.fleet.now < ended + scenario.patience:
+        while not self._quiet() and self.fleet.now < scenario.seconds + scenario.patience:
             self._pass(self.fleet.now + scenario.tick, told)
-        took = self.fleet.now - ended if self._quiet() else None
-        return self._report(took, ideal, time.perf_counter() - started)
+        return self.fleet.now - scenario.seconds if self._quiet() else None
 
     def _build_scene(self) -> Scene:
         s = self.scenario
@@ -177,13 +182,13 @@ class Mission:
         counts = {len(robot.agent.ledger.chains) for robot in honest}
         return len(counts) == 1 and self._apart() == 0.0 and self.fleet.agrees(honest)
 
-    def _ideal(self) -> float | None:
+    def _ideal(self, now: float) -> float | None:
         """How long a flood would take over the links as they are, each hop one mean delay."""
         low, high = self.scenario.link.delay
         hop = max((low + high) / 2 + self.scenario.link.tail, 0.001)
         names = [robot.name for robot in self.honest]
         reached = [1 << i for i in range(len(names))]
-        now, full = self.fleet.now, (1 << len(names)) - 1
+        full = (1 << len(names)) - 1
         step = max(hop, self.scenario.tick)
         spent = 0.0
         while any(mask != full for mask in reached):
@@ -200,7 +205,12 @@ class Mission:
             spent += hop if changed else step
         return spent
 
-    def _report(self, took: float | None, ideal: float | None, wall: float) -> Report:
+    def _quality(self, world: WorldMap) -> Quality | None:
+        if self._scene is None:
+            return None
+        return judge_quality(world, self._walkers, self.honest, self._scene)
+
+    def _report(self, took: float | None, wall: float) -> Report:
         robots, honest = list(self.fleet.robots.values()), self.honest
         digests = {robot.agent.digest() for robot in honest if robot.up}
         unique = {tx.id: len(tx.data) for robot in honest for tx in robot.agent.ledger}
@@ -215,7 +225,7 @@ class Mission:
             digest=min(digests).hex() if digests else "",
             agreement_s=took,
             agreement_periods=None if took is None else took / period,
-            ideal_s=ideal,
+            ideal_s=self._ideal(self.scenario.seconds),
             simulated_s=self.fleet.now,
             wall_s=wall,
             messages=self.fleet.delivered,
@@ -227,6 +237,8 @@ class Mission:
             divergence=self._divergence,
             map={"nodes": len(world), **{s.name.lower(): world.count(s) for s in State}},
             rejected=dict(sorted(self._rejected.items())),
-            quality=None if self._scene is None else judge_quality(honest, world, self._walkers, self._scene),
-            lies=None if not self.scenario.lying else judge_lies(honest, self.scenario.lying),
+            quality=self._quality(world),
+            lies=judge_lies(honest[0], honest, self.scenario.lying, self._scene)
+            if self.scenario.lying
+            else None,
         )

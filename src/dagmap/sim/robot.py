@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from ..agent import Agent, Parsers
-from ..model import AuthorId, ConfigError, Cycle, Event, Outgoing
+from ..model import AuthorId, ConfigError, Cycle, Event, Outgoing, TransactionId
 
 Moment: TypeAlias = Literal["between", "unsynced", "unsent"]
 Timed: TypeAlias = tuple[float, Cycle]  # when a cycle is handed in, s of simulated time
@@ -140,7 +140,8 @@ class Robot:
     messages: int = 0  # received
     observed_at: list[tuple[float, int]] = field(default_factory=list)  # (s, points)
     issued_at: list[tuple[float, int]] = field(default_factory=list)  # (s, features)
-    own: set[bytes] = field(default_factory=set)  # ids of what it truly issued
+    own: set[TransactionId] = field(default_factory=set)  # what it truly issued
+    withdrawn: set[int] = field(default_factory=set)  # numbers of issued features it took back
     source: Source | None = None
     stream: Iterator[Timed] = field(default_factory=lambda: iter(()))
     plays: bool = False  # whether its SLAM goes on
@@ -158,6 +159,7 @@ class Robot:
     def restart(self, now: float, parsers: Parsers) -> None:
         """Come back from the disk; the SLAM starts a new session."""
         self.up, self.doom = True, None
+        self.withdrawn.clear()  # what was not said before the crash never will be
         before = self.agent
         self.agent = Agent.restore(before.identity, before.config, self.disk.read(), parsers)
         self.session += 1
@@ -180,8 +182,16 @@ class Robot:
             self._stamps.add(stamp)
             self._ids.update(_whole(cycle.ids))
             self._ids.difference_update(removed)
+        self._note_withdrawn(removed)
         session = self.session or cycle.session
         return replace(cycle, stamp=stamp, moved=moved, removed=removed, session=session)
+
+    def _note_withdrawn(self, removed: object) -> None:
+        """Which issued features the SLAM takes back, as the agent numbers them."""
+        observing = self.agent.observing
+        nodes = np.array([observing.node_of(id_) for id_ in _whole(removed)], np.int64)
+        numbers = observing.issuance.number[nodes[nodes >= 0]]
+        self.withdrawn.update(numbers[numbers >= 0].tolist())
 
 
 def _whole(ids: object) -> list[int]:

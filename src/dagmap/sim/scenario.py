@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections import Counter
 from pathlib import Path
 from typing import Literal
 
@@ -55,13 +56,14 @@ class Chaos(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Liars(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """So many robots that lie in one way."""
+    """So many robots that lie in one way; "any": in a way that the seed draws for each."""
 
     kind: str
     count: int = 1
 
     def __post_init__(self) -> None:
-        self._require(self.kind in LIARS, "kind", f"one of {', '.join(sorted(LIARS))}")
+        known = [*sorted(LIARS), "any"]
+        self._require(self.kind in known, "kind", f"one of {', '.join(known)}")
         self._require(self.count >= 0, "count", "at least 0")
 
 
@@ -122,10 +124,12 @@ class Scenario(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return honest + [f"{group.kind}{i:02d}" for group in self.liars for i in range(group.count)]
 
     def drawn(self, seed: int) -> Scenario:
-        """The same scenario with every fault of the chaos as one of the listed faults."""
+        """The same scenario with the faults and the liars that the seed draws listed."""
         chance, chaos = random.Random(f"chaos {seed}"), self.chaos
+        liars = [liar for group in self.liars for liar in _drawn_liars(group, chance)]
         honest = self.names[: self.robots - self.lying]
         crashes, partitions = list(self.crashes), list(self.partitions)
+        names = msgspec.structs.replace(self, liars=tuple(liars)).names
         for _ in range(chaos.crashes):
             at = round(chance.uniform(0, self.seconds), 3)
             down = round(chance.uniform(*chaos.down), 3)
@@ -135,11 +139,15 @@ class Scenario(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):
         for _ in range(chaos.partitions):
             start = round(chance.uniform(0, self.seconds), 3)
             end = round(start + chance.uniform(*chaos.apart), 3)
-            side = tuple(sorted(chance.sample(self.names, chance.randint(1, self.robots))))
+            side = tuple(sorted(chance.sample(names, chance.randint(1, self.robots))))
             way: Literal["both", "in", "out"] = chance.choice(["both", "both", "in", "out"])
             partitions.append(Partition(start=start, end=end, robots=side, direction=way))
         return msgspec.structs.replace(
-            self, chaos=Chaos(), crashes=tuple(crashes), partitions=tuple(partitions)
+            self,
+            chaos=Chaos(),
+            crashes=tuple(crashes),
+            partitions=tuple(partitions),
+            liars=tuple(liars),
         )
 
     def clock(self, index: int, seed: int) -> Clock:
@@ -153,6 +161,13 @@ class Scenario(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def toml(self) -> bytes:
         """The scenario as a file: only what differs from the defaults, the name always."""
         return msgspec.toml.encode({"name": self.name, **_differing(self, Scenario())})
+
+
+def _drawn_liars(group: Liars, chance: random.Random) -> list[Liars]:
+    if group.kind != "any":
+        return [group]
+    drawn = Counter(chance.choice(sorted(LIARS)) for _ in range(group.count))
+    return [Liars(kind=kind, count=count) for kind, count in sorted(drawn.items())]
 
 
 def load_scenario(path: Path) -> Scenario:

@@ -29,7 +29,7 @@ class Timeline:
         self._sink(f"{self._now():.6f} {who} {text}")
 
 
-def _text(happening: Happening) -> str | None:  # noqa: C901
+def _text(happening: Happening) -> str | None:
     match happening:
         case Received(size):
             return f"receives {size} B"
@@ -52,7 +52,6 @@ def _text(happening: Happening) -> str | None:  # noqa: C901
             return f"restarts with {transactions} transactions"
         case MapChanged():
             return None
-    return None
 
 
 def _short(id_: bytes) -> str:
