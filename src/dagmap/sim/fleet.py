@@ -20,6 +20,7 @@ from ..agent import Agent, Parsers
 from ..config import Config
 from ..identity import Identity
 from ..model import Accepted, AuthorId, ConfigError, Cycle, DagmapError, Event, Issued
+from ..transaction import id_of
 from .network import Link, Network
 from .robot import (
     Clock,
@@ -254,7 +255,7 @@ class Fleet:
 
     def _die(self, robot: Robot, moment: Moment) -> None:
         robot.up, robot.doom = False, None
-        robot.disk.crash()
+        robot.own.difference_update(map(id_of, robot.disk.crash()))  # nobody was told of these
         if self._on_event is not None:
             self._on_event(robot, Crashed(moment))
 

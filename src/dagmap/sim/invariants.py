@@ -17,7 +17,7 @@ from .fleet import Fleet
 from .robot import Happening, Observed, Robot
 from .truth import transactions_anew
 
-_EVERY = 64  # events of a robot between two looks at the whole map
+_EVERY = 200  # events of a robot between two looks at the whole map
 _MOST = np.iinfo(np.int64).max
 
 
@@ -79,7 +79,6 @@ class Invariants:
         for robot in honest:
             self._robot = robot.name
             digests[robot.name] = robot.agent.digest()
-            self._map(robot.agent)
             self._withdrawn(robot, honest)
             chain = honest[0].agent.ledger.chain(robot.author)
             self._require(
@@ -87,6 +86,7 @@ class Invariants:
                 "a transaction was forgotten",
                 f"{honest[0].name} lacks some of {robot.name}'s",
             )
+        self._map(honest[0].agent)
         self._require(
             len(set(digests.values())) == 1,
             "the maps differ",

@@ -45,8 +45,10 @@ class Disk:
         self._safe += self._pending
         self._pending.clear()
 
-    def crash(self) -> None:
-        self._pending.clear()
+    def crash(self) -> list[bytes]:
+        """What is lost."""
+        lost, self._pending = self._pending, []
+        return lost
 
     def read(self) -> list[bytes]:
         return list(self._safe)

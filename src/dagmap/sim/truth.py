@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -13,7 +14,7 @@ from ..contribution import Author
 from ..fold import Verdict
 from ..metrics import nearest, thin
 from ..model import AuthorId, Bools, FrameId, Int32s, State
-from ..transaction import Transaction, parse
+from ..transaction import Transaction
 from ..worldmap import WorldMap
 from .robot import Robot
 from .scene import Scene, Walker
@@ -114,10 +115,10 @@ def _honest_fold(agent: Agent, good: set[AuthorId]) -> Consensus:
     return fold
 
 
-def transactions_anew(agent: Agent) -> Iterable[Transaction]:
-    """What counts in an agent's ledger, parsed again from its bytes, in canonical order."""
+def transactions_anew(agent: Agent) -> Iterator[Transaction]:
+    """What counts in an agent's ledger, its payload decoded again, in canonical order."""
     counting = sorted((tx for tx in agent.ledger if agent.ledger.counts(tx)), key=lambda tx: tx.key)
-    return (parse(tx.data, agent.config) for tx in counting)
+    return (replace(tx, payload=tx.decode_again(agent.config)) for tx in counting)
 
 
 def _authors(fold: Consensus, good: set[AuthorId]) -> list[Author]:
