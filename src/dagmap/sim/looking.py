@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeAlias
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -86,19 +86,16 @@ class Looking:
         first = self._cycles * self._new
         self._cycles += count
         ids = np.arange(first, first + count * self._new, dtype=np.uint64)
-        fresh = View(
-            measured * factor[..., None], true, ids.reshape(surface.shape), outliers, surface
-        )
-        self._remember(_Known(true, fresh.ids, kept & ~fresh.bad))
+        ids = ids.reshape(surface.shape)
+        view = View(measured * factor[..., None], true, ids, outliers, surface)
+        self._remember(_Known(true, ids, kept & ~view.bad))
         if self._again:
             old, old_kept = self._seen_again(noise[:, self._new :], baseline, poses, times)
-            columns = zip(old, fresh, strict=True)
-            fresh = View(*(np.concatenate(pair, axis=1) for pair in columns))
+            view = View(*(np.concatenate(pair, axis=1) for pair in _pairs(old, view)))
             kept = np.concatenate([old_kept, kept], axis=1)
-        ends = np.cumsum(kept.sum(axis=1)).tolist()
-        rows = View(*(column[kept] for column in fresh))
-        bounds = zip([0, *ends], ends, strict=False)
-        return [View(*(column[low:high] for column in rows)) for low, high in bounds]
+        ends = np.cumsum(kept.sum(axis=1))[:-1]
+        columns = (np.split(column[kept], ends) for column in view)
+        return [View(*rows) for rows in zip(*columns, strict=True)]
 
     def _shoot(
         self, rays: Floats, noise: Floats, baseline: Floats, poses: Floats, times: Sequence[float]
@@ -137,8 +134,8 @@ class Looking:
 
     def _remember(self, fresh: _Known) -> None:
         """Known are the cycles of this batch, and the `MEMORY` ones before each of them."""
-        columns = zip(self._known, fresh, strict=True)
-        self._known = _Known(*(np.concatenate([old[-MEMORY:], new]) for old, new in columns))
+        pairs = _pairs(self._known, fresh)
+        self._known = _Known(*(np.concatenate([old[-MEMORY:], new]) for old, new in pairs))
 
     def _baseline(self, times: Sequence[float], poses: Floats) -> Floats:
         """(N,) m by which the robot has moved since the last cycle (before the first: will)."""
@@ -147,6 +144,11 @@ class Looking:
         steps = np.diff(np.concatenate([self._before[None], poses]), axis=0)[:, :3]
         self._before = poses[-1]
         return np.asarray(np.sqrt((steps * steps).sum(axis=1)))
+
+
+def _pairs(one: tuple[Any, ...], two: tuple[Any, ...]) -> Iterator[tuple[Any, Any]]:
+    """The columns of two tables."""
+    return zip(one, two, strict=True)
 
 
 def turned(vectors: Floats, yaws: Floats) -> Floats:

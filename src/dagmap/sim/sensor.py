@@ -43,7 +43,7 @@ class SensorConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         self._require_range("pixel", 0.0, 100.0)
         self._require_range("focal", 1.0, 1e5)
         self._require_range("outliers", 0.0, 1.0)
-        self._require_range("tracked", 0.0, 1.0)
+        self._require_range("tracked", 0.0, 0.75)
 
 
 class Sensor:
