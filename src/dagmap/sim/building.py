@@ -103,9 +103,8 @@ class Building:
             end, side = way[index, axis], 2 * axis + up[index, axis]
             gate = self._gates[cell, side]
             on = gate >= 0
-            on[on] = self._through(
-                gate[on], at[on] + directions[rows[on]] * end[on, None], axis[on]
-            )
+            point = at[on] + directions[rows[on]] * end[on, None]
+            on[on] = self._through(gate[on], point, axis[on])
             if self.config.objects:
                 reach, number = enter(at, inv, self._box_low[cell], self._box_high[cell])
                 nearer = reach < end

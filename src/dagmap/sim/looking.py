@@ -85,16 +85,16 @@ class Looking:
         )
         first = self._cycles * self._new
         self._cycles += count
-        ids = np.arange(first, first + count * self._new, dtype=np.uint64)
-        ids = ids.reshape(surface.shape)
+        numbers = np.arange(first, first + count * self._new, dtype=np.uint64)
+        ids = numbers.reshape(surface.shape)
         view = View(measured * factor[..., None], true, ids, outliers, surface)
         self._remember(_Known(true, ids, kept & ~view.bad))
         if self._again:
             old, old_kept = self._seen_again(noise[:, self._new :], baseline, poses, times)
             view = View(*(np.concatenate(pair, axis=1) for pair in _pairs(old, view)))
             kept = np.concatenate([old_kept, kept], axis=1)
-        ends = np.cumsum(kept.sum(axis=1))[:-1]
-        columns = (np.split(column[kept], ends) for column in view)
+        ends = np.cumsum(kept.sum(axis=1)).tolist()
+        columns = (_split(column[kept], ends) for column in view)
         return [View(*rows) for rows in zip(*columns, strict=True)]
 
     def _shoot(
@@ -144,6 +144,10 @@ class Looking:
         steps = np.diff(np.concatenate([self._before[None], poses]), axis=0)[:, :3]
         self._before = poses[-1]
         return np.asarray(np.sqrt((steps * steps).sum(axis=1)))
+
+
+def _split(column: npt.NDArray[Any], ends: list[int]) -> list[Any]:
+    return [column[low:high] for low, high in zip([0, *ends[:-1]], ends, strict=True)]
 
 
 def _pairs(one: tuple[Any, ...], two: tuple[Any, ...]) -> Iterator[tuple[Any, Any]]:

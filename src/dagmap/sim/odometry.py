@@ -46,19 +46,14 @@ class Odometry:
         if k == 0:
             self._poses[0], self._way[0] = true, 0.0
             return
-        before, last = self._true[k - 1].tolist(), self._poses[k - 1].tolist()
+        before, drifted = self._true[k - 1].tolist(), float(self._poses[k - 1, 3])
         x, y, z, yaw = (new - old for new, old in zip(true, before, strict=True))
         length = math.hypot(x, y)
         keep = math.exp(-length / MEMORY)
         self._bias = keep * self._bias + math.sqrt(1 - keep * keep) * self._rng.standard_normal(4)
-        c, s = math.cos(last[3] - before[3]), math.sin(last[3] - before[3])
-        self._poses[k] = (
-            last[0] + c * x - s * y,
-            last[1] + s * x + c * y,
-            last[2] + z,
-            last[3] + yaw,
-        )
-        self._poses[k] += length * self._scale * self._bias
+        c, s = math.cos(drifted - before[3]), math.sin(drifted - before[3])
+        step = np.array((c * x - s * y, s * x + c * y, z, yaw))
+        self._poses[k] = self._poses[k - 1] + step + length * self._scale * self._bias
         self._way[k] = self._way[k - 1] + length
 
     def close(self) -> range:
