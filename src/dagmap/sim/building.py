@@ -91,7 +91,8 @@ class Building:
         """
         each = directions.shape[1]
         directions = directions.reshape(-1, 3)
-        inverses, ahead = inverse(directions), directions > 0
+        inverses = inverse(directions)
+        ahead = inverses > 0
         origin = np.repeat(origins, each, axis=0)
         depth = np.full(len(directions), np.inf)
         surface = np.full(len(directions), -1, np.int64)
@@ -132,8 +133,10 @@ class Building:
         out = np.empty(len(points))
         rooms = self.room_of(points)
         order = np.argsort(rooms, kind="stable")
-        names, starts = np.unique(rooms[order], return_index=True)
-        for room, rows in zip(names.tolist(), np.split(order, starts[1:]), strict=True):
+        names, counts = np.unique(rooms, return_counts=True)
+        ends = np.cumsum(counts)
+        for room, end, count in zip(names.tolist(), ends, counts, strict=True):
+            rows = order[end - count : end]
             cells = [room, *(gate for gate in self._gates[room].tolist() if gate >= 0)]
             faces = np.concatenate([self.faces(cell) for cell in cells])
             for i in range(0, len(rows), _ROWS):
