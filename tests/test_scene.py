@@ -338,6 +338,16 @@ def test_a_closure_returns_to_the_known_place_exactly() -> None:
     assert CLOSURE_LENGTH < 20.0
 
 
+def test_a_closure_after_every_cycle_moves_no_others() -> None:
+    sensor = SensorConfig(period=25.0, outliers=0.3)
+    walker = make(SceneConfig(rooms=(1, 1)), sensor, MotionConfig()).robot(0)
+    cycles = list(walker.cycles(1000.0))
+    assert any(c.moved is not None and len(c.moved[0]) == 0 for c in cycles)
+    one = agent("one")
+    for cycle in cycles:
+        one.observe(cycle, now=cycle.stamp)
+
+
 def test_removed_points_were_handed_in_and_are_wrong() -> None:
     walker, cycles = drifting(1)
     seen = walker.seen()

@@ -13,6 +13,7 @@ from .walk import MotionConfig
 MEMORY = 5.0  # m along which the direction of drift stays much the same
 CLOSURE_REACH = 0.8  # m: a place is known again this near
 CLOSURE_LENGTH = 10.0  # m walked at least since that place, and between loop closures
+_ROOM = 64  # cycles for which there is room at first
 
 
 class Odometry:
@@ -24,12 +25,13 @@ class Odometry:
 
     def __init__(self, motion: MotionConfig, rng: np.random.Generator) -> None:
         self._motion, self._rng = motion, rng
-        self._scale = np.array([motion.drift, motion.drift, motion.drift / 2, motion.drift_yaw])
-        self._bias = rng.standard_normal(4)
+        self._scale = motion.drift, motion.drift, motion.drift / 2, motion.drift_yaw
+        self._bias: list[float] = rng.standard_normal(4).tolist()
         self._count = 0
         self._closed = 0  # the cycle of the last closure
-        self._true, self._poses = np.empty((64, 4)), np.empty((64, 4))
-        self._way = np.empty(64)  # m walked up to each cycle
+        self._true, self._poses = np.empty((0, 4)), np.empty((0, 4))
+        self._way = np.empty(0)  # m walked up to each cycle
+        self._chance: list[list[float]] = []
 
     @property
     def poses(self) -> Floats:
@@ -40,21 +42,30 @@ class Odometry:
         """Go on to a true pose."""
         k, self._count = self._count, self._count + 1
         if k == len(self._way):
-            self._true, self._poses = (np.tile(a, (2, 1)) for a in (self._true, self._poses))
-            self._way = np.tile(self._way, 2)
+            self._grow()
         self._true[k] = true
         if k == 0:
             self._poses[0], self._way[0] = true, 0.0
             return
-        before, drifted = self._true[k - 1].tolist(), float(self._poses[k - 1, 3])
+        before, last = self._true[k - 1].tolist(), self._poses[k - 1].tolist()
         x, y, z, yaw = (new - old for new, old in zip(true, before, strict=True))
         length = math.hypot(x, y)
         keep = math.exp(-length / MEMORY)
-        self._bias = keep * self._bias + math.sqrt(1 - keep * keep) * self._rng.standard_normal(4)
-        c, s = math.cos(drifted - before[3]), math.sin(drifted - before[3])
-        step = np.array((c * x - s * y, s * x + c * y, z, yaw))
-        self._poses[k] = self._poses[k - 1] + step + length * self._scale * self._bias
+        fresh = math.sqrt(1 - keep * keep)
+        pairs = zip(self._bias, self._chance[k], strict=True)
+        self._bias = [keep * bias + fresh * chance for bias, chance in pairs]
+        c, s = math.cos(last[3] - before[3]), math.sin(last[3] - before[3])
+        step = (c * x - s * y, s * x + c * y, z, yaw)
+        terms = zip(last, step, self._scale, self._bias, strict=True)
+        self._poses[k] = [at + go + length * scale * bias for at, go, scale, bias in terms]
         self._way[k] = self._way[k - 1] + length
+
+    def _grow(self) -> None:
+        more = max(_ROOM, self._count)
+        self._true = np.concatenate([self._true, np.empty((more, 4))])
+        self._poses = np.concatenate([self._poses, np.empty((more, 4))])
+        self._way = np.concatenate([self._way, np.empty(more)])
+        self._chance += self._rng.standard_normal((more, 4)).tolist()
 
     def close(self) -> range:
         """Look for a place that is known, and correct the poses since the last closure.
@@ -98,11 +109,8 @@ def _turn(xy: Floats, yaw: float | Floats) -> Floats:
     return np.stack([c * xy[0] - s * xy[1], s * xy[0] + c * xy[1]])
 
 
-def pose_matrices(poses: Floats) -> Floats:
-    """(N, 4, 4) of poses (N, 4)."""
-    out = np.zeros((len(poses), 4, 4))
-    c, s = np.cos(poses[:, 3]), np.sin(poses[:, 3])
-    out[:, 0, 0], out[:, 0, 1], out[:, 1, 0], out[:, 1, 1] = c, -s, s, c
-    out[:, :3, 3] = poses[:, :3]
-    out[:, 2, 2] = out[:, 3, 3] = 1.0
-    return out
+def pose_matrix(pose: Sequence[float]) -> Floats:
+    """(4, 4) of a pose x, y, z, yaw."""
+    x, y, z, yaw = pose
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.array([[c, -s, 0.0, x], [s, c, 0.0, y], [0.0, 0.0, 1.0, z], [0.0, 0.0, 0.0, 1.0]])

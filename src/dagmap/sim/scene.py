@@ -22,7 +22,7 @@ import numpy.typing as npt
 from ..model import Bools, Cycle, Floats, Int64s
 from .building import Building, SceneConfig, enter, inverse
 from .looking import PERSON, Ids, Looking, Pose, View
-from .odometry import Odometry, pose_matrices
+from .odometry import Odometry, pose_matrix
 from .sensor import SensorConfig
 from .walk import MotionConfig, Route
 
@@ -144,7 +144,7 @@ class Walker:
         self._scene, self.index = scene, index
         seed = f"{scene.seed} robot {index}"
         self._route = Route(scene.building, room, scene.motion.speed, seed)
-        self._seen = [_NOTHING]
+        self._seen: list[tuple[float, int, View]] = []
 
     def position(self, t: float) -> tuple[float, float, float]:
         """True (x, y, z) of the sensor at a time in s, m in the fleet frame."""
@@ -174,15 +174,25 @@ class Walker:
         count = max(0, math.ceil((until - start) / period))
         for first in range(0, count, run.batch):
             numbers = range(first, min(first + run.batch, count))
-            for cycle, seen in run.cycles([start + number * period for number in numbers]):
-                self._seen.append(seen)
+            for cycle, view in run.cycles([start + number * period for number in numbers]):
+                self._seen.append((cycle.stamp, session, view))
                 yield cycle
 
     def seen(self) -> Seen:
         """All that was handed in by now, in that order."""
-        columns = zip(*self._seen, strict=True)
-        self._seen = [Seen(*(np.concatenate(column) for column in columns))]
-        return self._seen[0]
+        if not self._seen:
+            return _NOTHING
+        stamps, sessions, views = zip(*self._seen, strict=True)
+        counts = [len(view.ids) for view in views]
+        view = View(*(np.concatenate(column) for column in zip(*views, strict=True)))
+        return Seen(
+            view.true,
+            np.repeat(np.array(stamps), counts),
+            np.repeat(np.array(sessions, np.int64), counts),
+            view.ids,
+            view.outliers,
+            view.surface == PERSON,
+        )
 
 
 class _Run:
@@ -195,14 +205,14 @@ class _Run:
         self._rng = scene.chance(_SLAM, walker.index, session)
         self._odometry = Odometry(scene.motion, self._rng)
         self._stamps: list[float] = []
-        self._doubted: list[Ids] = []  # bad points since the last loop closure
+        self._recent: list[View] = []  # since the last loop closure
         self._palette = scene.chance(_COLORS).integers(0, 256, (64, 3), np.uint8)
         self.batch = self._looking.batch  # cycles at a time
 
-    def cycles(self, times: Sequence[float]) -> Iterator[tuple[Cycle, Seen]]:
+    def cycles(self, times: Sequence[float]) -> Iterator[tuple[Cycle, View]]:
         """The next cycles: `batch` of them, or fewer if they are the last."""
         for t, view in zip(times, self._looking.views(times), strict=True):
-            yield self._cycle(t, view), self._seen(t, view)
+            yield self._cycle(t, view), view
 
     def _cycle(self, t: float, view: View) -> Cycle:
         """Go on to where the robot is at `t`; correct the map where a place is known again."""
@@ -213,11 +223,13 @@ class _Run:
         if changed:
             poses = self._odometry.poses[changed.start : changed.stop - 1]
             stamps = np.array(self._stamps[changed.start : changed.stop - 1])
-            moved, removed = (stamps, pose_matrices(poses)), self._withdraw()
-        self._doubted.append(view.ids[view.bad])
+            matrices = [pose_matrix(pose) for pose in poses.tolist()]
+            moved = stamps, np.array(matrices).reshape(-1, 4, 4)
+            removed = self._withdraw()
+        self._recent.append(view)
         return Cycle(
             stamp=t,
-            pose=pose_matrices(self._odometry.poses[-1:])[0],
+            pose=pose_matrix(self._odometry.poses[-1].tolist()),
             points=view.local,
             ids=view.ids,
             colors=self._palette[view.surface % 64] if self._scene.sensor.colors else None,
@@ -228,11 +240,6 @@ class _Run:
 
     def _withdraw(self) -> Ids:
         """Ids of the points that a corrected map shows to be wrong: most of them."""
-        doubted, self._doubted = np.concatenate(self._doubted), []
+        doubted = np.concatenate([view.ids[view.bad] for view in self._recent])
+        self._recent = []
         return np.asarray(doubted[self._rng.random(len(doubted)) < FOUND_WRONG])
-
-    def _seen(self, t: float, view: View) -> Seen:
-        count = len(view.ids)
-        sessions = np.full(count, self._session, np.int64)
-        people = view.surface == PERSON
-        return Seen(view.true, np.full(count, t), sessions, view.ids, view.outliers, people)
