@@ -338,11 +338,13 @@ def test_a_closure_returns_to_the_known_place_exactly() -> None:
     assert CLOSURE_LENGTH < 20.0
 
 
-def test_a_closure_after_every_cycle_moves_no_others() -> None:
-    sensor = SensorConfig(period=25.0, outliers=0.3)
-    walker = make(SceneConfig(rooms=(1, 1)), sensor, MotionConfig()).robot(0)
-    cycles = list(walker.cycles(1000.0))
-    assert any(c.moved is not None and len(c.moved[0]) == 0 for c in cycles)
+def test_a_closure_after_every_cycle_moves_no_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = make(SceneConfig(rooms=(2, 1), room=12.0), SensorConfig(outliers=0.3), MotionConfig())
+    walker, centre = scene.robot(0), scene.building.centre
+    monkeypatch.setattr(walker, "pose", lambda t: (*centre(int(t) % 2), 1.0, 0.0))
+    cycles = list(walker.cycles(8.0))
+    moved = [None if c.moved is None else len(c.moved[0]) for c in cycles]
+    assert moved == [None, None, 1, 0, 0, 0, 0, 0]
     one = agent("one")
     for cycle in cycles:
         one.observe(cycle, now=cycle.stamp)
