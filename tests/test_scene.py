@@ -61,19 +61,17 @@ def all_faces(building: Building) -> np.ndarray:
     return np.concatenate([building.faces(cell) for cell in range(len(building.low))])
 
 
-def slow_cast(building: Building, origin: np.ndarray, ray: np.ndarray) -> float:
+def slow_cast(faces: np.ndarray, origin: np.ndarray, ray: np.ndarray) -> float:
     """The twin of `cast`: one ray against every rectangle of the building."""
-    best = np.inf
-    for low, high in all_faces(building):
-        axis = int(np.argmin(high - low))
-        if ray[axis] == 0:
-            continue
-        t = (low[axis] - origin[axis]) / ray[axis]
-        hit = origin + t * ray
-        others = [a for a in range(3) if a != axis]
-        if t > 0 and (low[others] <= hit[others]).all() and (hit[others] <= high[others]).all():
-            best = min(best, t)
-    return best
+    low, high = faces[:, 0], faces[:, 1]
+    row, axis = np.arange(len(faces)), np.argmin(high - low, axis=1)
+    with np.errstate(divide="ignore"):
+        t = (low[row, axis] - origin[axis]) / ray[axis]
+    ahead = np.isfinite(t) & (t > 0)
+    hit = origin + np.where(ahead, t, 0.0)[:, None] * ray
+    inside = (low <= hit) & (hit <= high)
+    inside[row, axis] = True
+    return float(t[ahead & inside.all(axis=1)].min())
 
 
 BUILDINGS = [
@@ -94,8 +92,9 @@ def test_rays_end_where_the_first_rectangle_is(config: SceneConfig) -> None:
     rays[:, 0], rays[:, 1] = (1.0, 0.0, 0.0), (0.0, -1.0, 0.0)  # along the walls too
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
     depth, surface = scene.building.cast(places, rays, 1000.0)
+    faces = all_faces(scene.building)
     for i, j in itertools.product(range(12), range(25)):
-        assert depth[i, j] == pytest.approx(slow_cast(scene.building, places[i], rays[i, j]))
+        assert depth[i, j] == pytest.approx(slow_cast(faces, places[i], rays[i, j]))
     assert (surface >= 0).all()
     shorter, surface = scene.building.cast(places, rays, 2.0)
     np.testing.assert_array_equal(shorter, np.where(depth <= 2.0, depth, np.inf))
@@ -129,7 +128,7 @@ def test_truth_covers_every_surface_once() -> None:
 
 
 def test_every_room_can_be_reached_and_walkers_keep_clear_of_all() -> None:
-    for seed in range(20):
+    for seed in range(6):
         scene = make(SceneConfig(rooms=(3, 4), doors=0.0, objects=16), seed=seed)
         reached, todo = {0}, [0]
         while todo:
