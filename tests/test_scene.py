@@ -121,6 +121,9 @@ def test_truth_covers_every_surface_once() -> None:
     faces = all_faces(scene.building)
     sides = np.sort(faces[:, 1] - faces[:, 0], axis=1)
     assert len(truth) == pytest.approx((sides[:, 1] * sides[:, 2]).sum() / 0.01, rel=0.15)
+    floor = truth[truth[:, 2] < 1e-9] + (0.0, 0.0, 1e-6)  # none of it lies below a box
+    above = scene.building.cast(floor, np.tile([0.0, 0.0, 1.0], (len(floor), 1, 1)), 100.0)[0]
+    assert set(np.round(above.ravel(), 3).tolist()) == {2.5, DOOR_HEIGHT}
     list(scene.robot(0).cycles(60.0))
     seen = scene.robot(0).seen().reference
     gaps = np.array([np.abs(truth - point).max(axis=1).min() for point in seen[::20]])
@@ -337,6 +340,32 @@ def test_a_closure_returns_to_the_known_place_exactly() -> None:
     assert CLOSURE_LENGTH < 20.0
 
 
+def test_a_closure_at_a_place_that_is_off_itself_keeps_what_was_seen_between_them() -> None:
+    odometry = Odometry(MotionConfig(drift=0.02, drift_yaw=0.05), np.random.default_rng(1))
+    truth = [(float(x), 0.0, 1.0, 0.0) for x in [*range(16), *range(14, 7, -1)]]
+    for pose in truth:
+        odometry.step(pose)
+        changed = odometry.close()
+        if changed:
+            break
+    near, far = odometry.poses[changed.stop - 1], odometry.poses[10]
+    assert changed.stop - 1 == 20 and truth[20] == truth[10]
+    assert np.abs(far - truth[10]).max() > 0.01
+    np.testing.assert_allclose(near, far, atol=1e-9)
+
+
+def test_a_constant_drift_is_corrected_altogether(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dagmap.sim.odometry.MEMORY", np.inf)  # the drift's direction stays
+    odometry = Odometry(MotionConfig(drift=0.0, drift_yaw=0.03), np.random.default_rng(2))
+    corners = [(0, 0), (1, 0), (2, 0), (3, 0), (3, 1), (3, 2), (3, 3), (2, 3), (1, 3), (0, 3)]
+    truth = [(float(x), float(y), 1.0, 0.1 * x * y) for x, y in [*corners, (0, 2), (0, 1), (0, 0)]]
+    for pose in truth:
+        odometry.step(pose)
+    assert np.abs(odometry.poses - truth).max() > 0.1
+    assert odometry.close() == range(1, 13)
+    np.testing.assert_allclose(odometry.poses, truth, atol=1e-9)
+
+
 def test_a_closure_after_every_cycle_moves_no_others(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = make(SceneConfig(rooms=(2, 1), room=12.0), SensorConfig(outliers=0.3), MotionConfig())
     walker, centre = scene.robot(0), scene.building.centre
@@ -447,6 +476,9 @@ def test_any_robot_alone_is_the_same_as_among_others() -> None:
             cycles.append(cycle)
     assert [bytes_of(cycles) for cycles in taken] == [stream(6, 5), stream(1, 0), stream(4, 3)]
     assert len({bytes_of(cycles) for cycles in taken}) == 3
+    rays = [np.asarray(cycles[0].points) for cycles in taken]
+    looks = [set(np.round(ray[:, 1:] / ray[:, :1], 6).ravel().tolist()) for ray in rays]
+    assert not looks[0] & looks[1] and not looks[1] & looks[2]
 
 
 def test_a_shorter_run_is_the_beginning_of_a_longer_one() -> None:

@@ -68,7 +68,7 @@ class Odometry:
         self._chance += self._rng.standard_normal((more, 4)).tolist()
 
     def close(self) -> range:
-        """Look for a place that is known, and correct the poses since the last closure.
+        """Look for a place that is known, and correct the poses since then, or the last closure.
 
         Gives the numbers of the cycles that moved, the newest included; none without a closure.
         """
@@ -79,8 +79,9 @@ class Odometry:
         known = np.flatnonzero(~far & (way[k] - way[: k + 1] >= CLOSURE_LENGTH))
         if len(known) == 0:
             return range(0)
-        first, self._closed = self._closed, k
-        self._bend(first, k, self._measured(int(known[0]), k))
+        j = int(known[0])
+        first, self._closed = max(j, self._closed), k  # what is not in the loop stays
+        self._bend(first, k, self._measured(j, k))
         return range(first + 1, k + 1)
 
     def _measured(self, j: int, k: int) -> Floats:
