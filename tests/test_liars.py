@@ -77,7 +77,7 @@ def test_what_outweighs_the_liars_is_never_lost(kind: str, liars: int) -> None:
 
 
 def test_one_witness_less_and_it_is_lost() -> None:
-    """Erasers outvote places where honest hits exceed honest misses by no more than their number."""
+    """Erasers outvote places where honest hits exceed honest misses by no more than they are."""
     mission, _ = played(room("eraser", 3))
     honest = mission.honest
     assert judge_lies(honest[0], honest, liars=3).proven_lost == 0
@@ -88,7 +88,6 @@ def test_one_witness_less_and_it_is_lost() -> None:
     ("kind", "reason"),
     [
         ("wrong-prover", "signature does not match"),
-        ("forker", "beyond a proven fork of its author"),
         ("false-dater", "Lamport time does not follow from its references"),
         ("babbler", "checksum does not match"),
     ],
@@ -97,6 +96,14 @@ def test_a_refusal_says_why(kind: str, reason: str) -> None:
     few = msgspec.structs.replace(ROOM.sensor, points=20)
     report = played(room(kind, 1, seconds=8.0, sensor=few))[1]
     assert report.rejected.get(reason, 0) > 0, report.rejected
+
+
+def test_a_fork_is_cut_on_every_robot() -> None:
+    few = msgspec.structs.replace(ROOM.sensor, points=20)
+    mission, _ = played(room("forker", 1, seconds=8.0, sensor=few))
+    liar = mission.fleet.robots["forker00"].author
+    cuts = {robot.agent.ledger.chain(liar).cut for robot in mission.honest}
+    assert len(cuts) == 1 and cuts != {None}
 
 
 def test_a_flood_stays_within_the_waiting_room() -> None:
