@@ -69,11 +69,18 @@ def test_what_only_liars_say_is_confirmed_from_witnesses_liars_on(
         assert beyond is not None and beyond.liars_confirmed > 0, "one liar more and the bound ends"
 
 
-@pytest.mark.parametrize("kind", SAYING)
+@pytest.mark.parametrize("kind", ["forger", "eraser", "wrong-frame"])
 @pytest.mark.parametrize("liars", [1, 2])
 def test_what_outweighs_the_liars_is_never_lost(kind: str, liars: int) -> None:
     lies = played(room(kind, liars))[1].lies
     assert lies is not None and lies.proven_nodes > 50 and lies.proven_lost == 0
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_splitting_what_others_saw_gains_next_to_nothing(seed: int) -> None:
+    """Seeds planted beside a place can share its hits out among nodes that are outvoted apart."""
+    lies = played(room("splitter", 1), seed)[1].lies
+    assert lies is not None and lies.proven_lost <= lies.proven_nodes // 100
 
 
 def test_one_witness_less_and_it_is_lost() -> None:
