@@ -92,7 +92,7 @@ class Runtime:
         self.counts = Counts()
         self.started = time.monotonic()
         self._next_tick = self._next_state = self.started
-        self._last_news = self.started
+        self._last_news = 0.0  # on the agent's clock
         self._stopping = False
 
     @property
@@ -108,8 +108,8 @@ class Runtime:
         """Work until stopped.
 
         slam: where cycles come from; None: from nowhere, the robot only listens.
-        until_agreed: return as well once the SLAM is over and nobody in reach has asked or told
-            anything new for so many seconds. None: go on and serve.
+        until_agreed: return as well once the SLAM is over and everybody in reach has announced
+            itself, but asked and told nothing new for so many seconds. None: go on and serve.
         Raises StoreError (nothing that is not stored was sent) and what the SLAM raised.
         """
         while not self._stopping:
@@ -135,7 +135,7 @@ class Runtime:
         out = self.agent.outbox()
         self.network.send(out)
         if any(_is_news(data) for data in (*work.messages, *(each.data for each in out))):
-            self._last_news = time.monotonic()
+            self._last_news = self.now
         self._note(events)
         for question in work.questions:
             self._answer(question)
@@ -216,9 +216,12 @@ class Runtime:
         }
 
     def _quiet(self, seconds: float) -> bool:
-        """Whether all that is to be said here was said, and there was no news for a while."""
-        busy = self.agent.holds_back or self.network.waiting_bytes
-        return not busy and time.monotonic() - self._last_news >= seconds
+        """Whether all is said here, and the others were heard since the last news."""
+        if self.agent.holds_back or self.network.waiting_bytes:
+            return False
+        peers, last = self.agent.sync.peers, self._last_news
+        heard = all(who in peers and peers[who].heard > last for who in self.network.here)
+        return heard and self.now - last >= seconds
 
     def _answer(self, question: Question) -> None:
         question.answer = self._report(self)

@@ -35,7 +35,7 @@ class TlsConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class NetworkConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How the robots reach each other, and what is kept for them at most."""
 
-    mode: Literal["peer", "router", "client"] = "peer"
+    mode: Literal["peer", "router", "client"] = "peer"  # a router relays between its clients
     listen: tuple[str, ...] = ()  # endpoints such as "tcp/0.0.0.0:7447"; none: any free port
     connect: tuple[str, ...] = ()  # endpoints of other robots, tried again and again
     scouting: bool = True  # look for robots by multicast
