@@ -17,6 +17,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dagmap import Agent, Cycle, DagmapError, Identity
 from dagmap.io.data_folder import load_identity
 from dagmap.io.settings import load_settings
@@ -64,6 +66,14 @@ def plain(seed: int, **more: Any) -> Iterator[Cycle]:
 def record(path: Path, seed: int, count: int = 8, points: int = 40) -> Path:
     """A recording of `count` cycles, a second apart."""
     save_cycles(path, plain(seed, count=count, points=points))
+    return path
+
+
+def record_much(path: Path, count: int = 60, points: int = 1500) -> Path:
+    """A recording that makes many bytes: every cycle sees another part of a wall."""
+    rng = np.random.default_rng(3)
+    walls = (rng.uniform([2, i, 0], [2, i + 1, 1], (points, 3)) for i in range(count))
+    save_cycles(path, (Cycle(float(i), np.eye(4), wall) for i, wall in enumerate(walls)))
     return path
 
 
@@ -244,15 +254,18 @@ def agreed(*robots: Robot, authors: int = 0) -> list[dict[str, Any]]:
 
 
 class Proxy:
-    """A TCP proxy on loopback that can be cut and healed."""
+    """A TCP proxy on loopback that can be cut and healed, or stalled for a while."""
 
     def __init__(self, target: int) -> None:
         self._target = target
         self._cut = False
+        self.flowing = threading.Event()  # cleared: connections stay, nothing passes
+        self.flowing.set()
         self._open: list[socket.socket] = []
         self._lock = threading.Lock()
         self._threads: list[threading.Thread] = []
         self._listener = socket.create_server(("127.0.0.1", 0))
+        self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 14)  # stalls soon
         self.port = int(self._listener.getsockname()[1])
         self._run(self._accept)
 
@@ -267,6 +280,7 @@ class Proxy:
         self._cut = False
 
     def close(self) -> None:
+        self.flowing.set()
         self.cut()
         self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
@@ -301,7 +315,7 @@ class Proxy:
     def _pump(self, source: socket.socket, sink: socket.socket, left: list[int]) -> None:
         with suppress(OSError):
             source.settimeout(None)
-            while data := source.recv(1 << 16):
+            while self.flowing.wait() and (data := source.recv(1 << 12)):
                 sink.sendall(data)
         for sock in (source, sink):
             with suppress(OSError):

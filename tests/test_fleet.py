@@ -13,7 +13,7 @@ from dagmap import Config
 from dagmap.cli.status import show_status
 from dagmap.io.transport import load_zenoh
 from dagmap.messages import MAX_MESSAGE, Heads, Want, encode
-from robots import PARAMETERS, Nursery, Proxy, Robot, agreed, record, running, until
+from robots import PARAMETERS, Nursery, Proxy, Robot, agreed, record, record_much, running, until
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +126,28 @@ class TestAgreement:
             proxy.heal()
             together = until(lambda: agreed(a, b, authors=2), "agreement")
             assert together[0]["transactions"] > max(answer["transactions"] for answer in apart)
+        proxy.close()
+
+    def test_a_stalled_link_does_not_hold_up_the_slam(
+        self, nursery: Nursery, tmp_path: Path
+    ) -> None:
+        a = Robot(nursery, tmp_path, "a", record_much(tmp_path / "long.npz"))
+        b = Robot(nursery, tmp_path, "b")
+        proxy = Proxy(b.port)
+        a.connect = (proxy.port,)
+        a.more = f"send_bytes = {1 << 16}"
+        with running(a, b):
+            b.start()
+            until(b.status, "b")
+            a.start("--speed", 30, "--wait-for", 1)
+            until(lambda: a.status().get("cycles", 0) >= 2, "a to begin")
+            proxy.flowing.clear()
+            stalled = until(lambda: a.status()["cycles"] == 60 and a.status(), "a to end")
+            assert stalled["lag"]["unsent_bytes"] > 0 or stalled["traffic"]["dropped"]["sent"] > 0
+            assert b.status()["transactions"] < stalled["transactions"]
+            proxy.flowing.set()
+            until(lambda: agreed(a, b, authors=1), "agreement")
+            assert b.status()["transactions"] >= stalled["transactions"]
         proxy.close()
 
     def test_stopping_is_graceful_and_a_second_signal_is_immediate(
