@@ -15,7 +15,7 @@ import msgspec
 from .model import LIMIT_MM, ConfigError, CycleError, quantise_pose
 
 
-class Checked(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class _Checked(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A frozen group of parameters; `_require` names the one that is wrong and what is wanted."""
 
     def _require(self, holds: bool, name: str, wanted: str) -> None:
@@ -29,7 +29,7 @@ class Checked(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         self._require(holds and low <= value <= high, name, f"{low} to {high} is wanted")
 
 
-class GraphConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class GraphConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Section 4.1: the adjacency DAG. `n_p`, `n_c_max` are fleet-wide: receivers check them."""
 
     n_p: int = 2  # N_p, parents of a node at most
@@ -65,7 +65,7 @@ class GraphConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=True
         return -1 if self.max_parent_distance is None else round(self.max_parent_distance * 1000)
 
 
-class IssuanceConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class IssuanceConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Section 4.2 and Eq. (6): how much goes out, and when."""
 
     features_per_bundle: int = 1400  # N'_f: what a bundle holds at most; the furthest are cut
@@ -81,7 +81,7 @@ class IssuanceConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
             self._require_range("features_per_second", 0.1, 1e9)
 
 
-class TransactionConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class TransactionConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Section 4.2: the envelope. Fleet-wide, since every receiver judges by it."""
 
     proof_of_work_bits: int = 6  # hashcash: 2^bits hashes to issue, one to check
@@ -92,7 +92,7 @@ class TransactionConfig(Checked, frozen=True, kw_only=True, forbid_unknown_field
         self._require_range("max_references", 0, 16)
 
 
-class FoldConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class FoldConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Section 4.3: the map consensus. All of it is fleet-wide."""
 
     preset: Literal["default", "paper"] = "default"
@@ -127,7 +127,7 @@ class FoldConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=True)
         return round(self.max_ray * 1000)
 
 
-class LedgerConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class LedgerConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Bounds on what is kept for others; a bound never decides what is valid."""
 
     waiting_transactions: int = 4096  # the waiting room: transactions without their references
@@ -140,7 +140,7 @@ class LedgerConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         self._require_range("fold_per_tick", 1, 1 << 40)
 
 
-class SyncConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class SyncConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Spreading and repair."""
 
     announce_period: float = 1.0  # s between announcements of the heads
@@ -153,7 +153,7 @@ class SyncConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=True)
         self._require_range("chunk_bytes", 1 << 16, 1 << 30)
 
 
-class Config(Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All parameters of one participant.
 
     fleet: name of the fleet. Its hash, with that of the fleet-wide parameters, heads every message.

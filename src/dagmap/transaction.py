@@ -70,6 +70,11 @@ def id_of(data: bytes) -> TransactionId:
     return hashlib.blake2b(data, digest_size=32).digest()
 
 
+def signed_part(data: bytes, config: Config) -> bytes:
+    """What the signature at the end of a transaction's bytes covers."""
+    return _SIGNED + config.fleet_id + data[:-64]
+
+
 def seal(
     identity: Identity,
     config: Config,
@@ -123,7 +128,7 @@ def _parse(
     reader.end()
     if not _work_holds(_work_seed(config, unworked), nonce, config):
         raise Refusal(Reason.PROOF_OF_WORK)
-    if not signature_holds(public_key, signature, _SIGNED + config.fleet_id + data[:-64]):
+    if not signature_holds(public_key, signature, signed_part(data, config)):
         raise Refusal(Reason.SIGNATURE)
     payload = decode_payload(body, config.graph.n_p)
     _check_structure(payload, config)

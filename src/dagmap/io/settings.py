@@ -12,11 +12,11 @@ from typing import Literal
 
 import msgspec
 
-from ..config import Checked, Config, load_config
+from ..config import _Checked, Config, load_config
 from ..model import ConfigError
 
 
-class SourceConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class SourceConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The recording that stands in for a SLAM. Without this table the robot only listens."""
 
     path: str  # a TUM RGB-D folder or a cycle stream .npz
@@ -24,7 +24,7 @@ class SourceConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     camera: str | None = None  # a camera.json to use instead of the recording's own
 
 
-class TlsConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class TlsConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """PEM files. Both ends show a certificate of the authority, or there is no connection."""
 
     ca: str
@@ -32,7 +32,7 @@ class TlsConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     key: str
 
 
-class NetworkConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class NetworkConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How the robots reach each other, and what is kept for them at most."""
 
     mode: Literal["peer", "router", "client"] = "peer"  # a router relays between its clients
@@ -66,13 +66,13 @@ class NetworkConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             self._require(secure, name, "with [network.tls] every endpoint begins with tls/")
 
 
-class StoreConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class StoreConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where the ledger is. Its folder is the robot's data folder, made where it is missing."""
 
     path: str
 
 
-class MetricsConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class MetricsConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Numbers for Prometheus under http://LISTEN/metrics; off unless an address is given."""
 
     listen: str | None = None  # "127.0.0.1:9464"; anybody who reaches the address can read it
@@ -91,7 +91,7 @@ class MetricsConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return host.strip("[]"), int(port)
 
 
-class ControlConfig(Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ControlConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The socket that `dagmap status` asks, for this user only."""
 
     path: str | None = None  # default: status.sock beside the ledger
