@@ -12,7 +12,7 @@ from typing import Literal
 
 import msgspec
 
-from ..config import _Checked, Config, load_config
+from ..config import Config, _Checked, load_config
 from ..model import ConfigError
 
 
