@@ -36,11 +36,9 @@ def fleet_transactions(robots: int = 3, seed: int = 0) -> Stored:
     return stored
 
 
-def listener(
-    data: list[bytes], checkpoint: bytes | None = None, config: Config = scene.QUICK
-) -> Agent:
+def listener(data: list[bytes], checkpoint: bytes | None = None) -> Agent:
     identity = scene.agent("listener").identity
-    return Agent.restore(identity, config, data, checkpoint=checkpoint)
+    return Agent.restore(identity, scene.QUICK, data, checkpoint=checkpoint)
 
 
 @pytest.fixture(scope="module")
