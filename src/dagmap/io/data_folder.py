@@ -12,6 +12,7 @@ from ..agent import Agent
 from ..identity import Identity
 from ..model import StoreError
 from ..transaction import id_of
+from .checkpoint_file import read_checkpoint
 from .settings import Settings
 from .store import Store
 
@@ -64,7 +65,8 @@ def restore(settings: Settings, identity: Identity, store: Store, track: Track) 
 
     track: wraps the transactions (their number is known) to show how far it is.
     """
-    agent = Agent.restore(identity, settings.config, track(store, len(store)))
+    tracked = track(store, len(store))
+    agent = Agent.restore(identity, settings.config, tracked, checkpoint=read_checkpoint(store))
     lost = sum(agent.ledger.find(id_of(data)) is None for data in store)
     if lost:
         raise StoreError(

@@ -85,10 +85,14 @@ class Runtime:
         inbox: Inbox,
         log: Log,
         report: Callable[[Runtime], dict[str, object]],
+        keep: Callable[[Agent], None] = lambda agent: None,
     ) -> None:
-        """report: the answer to a question that somebody puts into the inbox."""
+        """report: the answer to a question that somebody puts into the inbox.
+
+        keep: called now and then, to keep what makes the next start faster.
+        """
         self.agent, self.network, self.inbox = agent, network, inbox
-        self._store, self._log, self._report = store, log, report
+        self._store, self._log, self._report, self._keep_state = store, log, report, keep
         self.counts = Counts()
         self.started = time.monotonic()
         self._next_tick = self._next_state = self.started
@@ -183,6 +187,7 @@ class Runtime:
         if time.monotonic() >= self._next_state:
             self._next_state = time.monotonic() + _STATE_PERIOD
             self._log.write("info", "state", **self._state())
+            self._keep_state(self.agent)
 
     def _note_refusal(self, event: Rejected) -> None:
         self.counts.refused[event.reason] += 1

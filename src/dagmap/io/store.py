@@ -114,6 +114,12 @@ class Store:
                     )
                 yield data
 
+    def ids(self) -> list[TransactionId]:
+        """The ids of all transactions in order of insertion."""
+        with _explained(self.path, "cannot be read"):
+            rows = self._in_use.execute("SELECT id FROM transactions ORDER BY position").fetchall()
+        return [id_ for (id_,) in rows]
+
     def __len__(self) -> int:
         with _explained(self.path, "cannot be read"):
             return int(self._in_use.execute("SELECT count(*) FROM transactions").fetchone()[0])
