@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from dagmap import Agent, Cycle, GraphConfig
+from dagmap import Agent, Config, Cycle, GraphConfig
 from dagmap.cli import app
 from dagmap.config import TransactionConfig, load_config
 from dagmap.io.keys import Fleet, create_fleet, load_identity, open_fleet, open_robot
@@ -60,6 +60,19 @@ def test_the_commands_make_a_fleet_whose_robots_map_together(tmp_path: Path) -> 
             taker.receive(out.data, 0.0)
     assert agents[0].digest() == agents[1].digest() and len(agents[0].map)
     assert agents[0].robots.keys() == {"robot1", "robot2"}
+
+
+def test_parameters_of_the_fleet_go_to_its_robots_and_into_its_revocations(tmp_path: Path) -> None:
+    create_fleet(tmp_path / "fleet", "office")
+    with open(tmp_path / "fleet" / "fleet.toml", "a") as file:
+        file.write("[transaction]\nproof_of_work_bits = 9\n[fold]\nwitnesses = 3\n")
+    fleet = open_fleet(tmp_path / "fleet")
+    fleet.enroll("robot1", tmp_path / "robot1", 365)
+    robot = open_robot(tmp_path / "robot1")
+    assert (robot.name, robot.config.name) == ("robot1", "robot1")
+    assert robot.config.parameters_id == fleet.config.parameters_id != Config().parameters_id
+    data = fleet.revoke("robot1", 0).read_bytes()
+    assert Agent(robot.identity, robot.config).take(data)[0] == Revoked(robot.identity.author, 1)
 
 
 def test_a_revocation_file_goes_through_the_door(fleet: Fleet, tmp_path: Path) -> None:
@@ -211,6 +224,8 @@ def test_folders_that_are_damaged_or_mixed_up(fleet: Fleet, tmp_path: Path) -> N
     swapped(mine / "robot.toml", b"x = 1", robot, "robot.toml: .*unknown field `x`")
     theirs = (other.folder / "fleet.toml").read_bytes()
     swapped(fleet.folder / "fleet.toml", theirs, home, "another fleet_key than that of fleet.key")
+    toml = fleet.folder / "fleet.toml"
+    swapped(toml, b"name = 'x'\n" + toml.read_bytes(), home, "name is a robot's, not the fleet's")
     entry = fleet.folder / "robots" / "robot1.json"
     swapped(entry, b"{}", lambda: home().robots(), "robot1.json: damaged")
     revoked = fleet.revoke("robot1", 4)

@@ -2,7 +2,7 @@
 
     fleet folder                                robot folder
     fleet.key     the fleet's private key       robot.key    the robot's private key
-    fleet.toml    fleet, fleet_key              robot.toml   fleet, fleet_key, name
+    fleet.toml    fleet, fleet_key, ...         robot.toml   its name, and all of fleet.toml
     ca.pem        X.509 authority for TLS       certificate  hexadecimal, see identity.py
     robots/       NAME.json, who is enrolled    tls.pem, ca.pem
     revocations/  0000.tx, 0001.tx, ...
@@ -110,9 +110,8 @@ class Fleet:
         with _new_folder(out) as folder:
             _write_new(folder / "robot.key", _pem(key), 0o600)
             _write_new(folder / "certificate", certificate.hex().encode() + b"\n")
-            quoted = json.dumps(self.config.fleet, ensure_ascii=False)
-            lines = f'fleet = {quoted}\nfleet_key = "{self.config.fleet_key}"\nname = "{name}"\n'
-            _write_new(folder / "robot.toml", lines.encode())
+            lines = f'name = "{name}"\n\n'.encode() + _read(self.folder / "fleet.toml")
+            _write_new(folder / "robot.toml", lines)
             _write_new(folder / "tls.pem", self._leaf(public_key, name, addresses, days))
             _write_new(folder / "ca.pem", _read(self.folder / "ca.pem"))
             _write_new(entry, json.dumps({"public_key": public_key.hex()}).encode() + b"\n")
@@ -205,6 +204,8 @@ def create_fleet(folder: Path, name: str) -> Fleet:
 def open_fleet(folder: Path) -> Fleet:
     """Read a fleet's folder. Raises KeysError where it is none, damaged or open to others."""
     config, key = _config(folder / "fleet.toml"), _private_key(folder / "fleet.key")
+    if config.name:
+        raise KeysError(f"{folder / 'fleet.toml'}: name is a robot's, not the fleet's; take it out")
     if config.fleet_key != key.public_key().public_bytes_raw().hex():
         raise KeysError(
             f"{folder}: fleet.toml names another fleet_key than that of fleet.key; "
