@@ -6,6 +6,7 @@ a pure function of the set, whatever order it arrives in.
 
 from __future__ import annotations
 
+import itertools
 import random
 from dataclasses import replace
 from functools import lru_cache
@@ -20,7 +21,7 @@ import dagmap.transaction
 from chains import CONFIG, FLEET_KEY, Author, anchor, closed, enrolled, identity
 from dagmap import Agent, Config, ConfigError, Cycle
 from dagmap.identity import certificate_holds
-from dagmap.messages import Transactions, Want, encode
+from dagmap.messages import Head, Heads, Transactions, Want, encode
 from dagmap.messages import parse as parse_message
 from dagmap.model import Accepted, Event, Forked, Reason, Rejected, Revoked, Waiting
 from dagmap.payload import Payload, Revocation, encode_payload
@@ -30,6 +31,7 @@ from scene import QUICK
 
 CLOSED = closed()
 MAPPING = closed(QUICK)
+ROUNDS = itertools.count()
 WALL = np.random.default_rng(0).uniform([2, -1, -1], [2, 1, 1], (60, 3))
 
 
@@ -442,20 +444,84 @@ def test_robots_that_hold_different_parts_of_it_agree_by_asking(seed: int) -> No
     assert len({agent.digest() for agent in agents}) == 1
 
 
-def test_a_fork_beyond_a_revocation_is_not_asked_about_for_ever() -> None:
+def questions(agent: Agent, *heads: Head) -> list[Want]:
+    """What a robot asks a neighbour that announces these heads, and in the ten seconds after."""
+    agent.outbox()
+    start = 100.0 * next(ROUNDS)  # later than every question before
+    agent.receive(encode(Heads(1, (), heads), agent.config, b"neighbor"), start)
+    for step in range(20):
+        agent.tick(start + 0.5 * step)
+    messages = [parse_message(out.data, agent.config)[1] for out in agent.outbox()]
+    return [message for message in messages if isinstance(message, Want)]
+
+
+def test_a_fork_beyond_a_revocation_is_not_asked_about() -> None:
     agent, robot, fleet = listener(), Author("a", CLOSED), Author(FLEET_KEY, CLOSED)
     chain = [robot.make() for _ in range(2)]
     left, right = list(chain), list(chain)
     for branch, size in ((left, 1), (right, 2)):
         for _ in range(3):
             branch.append(robot.make(features=size, after=branch))
-    hear(agent, *left, fleet.revoke(2, robot), right[4])
+    hear(agent, *left, right[4])
     assert agent.ledger.chain(robot.identity.author).cut == 4
-    agent.outbox()
-    for step in range(20):
-        agent.tick(0.5 * step)
-        questions = [parse_message(o.data, CLOSED)[1] for o in agent.outbox()]
-        assert not any(isinstance(question, Want) for question in questions)
+    assert questions(agent) == [Want((), (right[3].id,))] * 10
+    hear(agent, fleet.revoke(2, robot))
+    assert not questions(agent)
+
+
+def test_what_a_revoked_robot_went_on_to_say_is_not_asked_for() -> None:
+    robot, fleet = Author("a", CLOSED), Author(FLEET_KEY, CLOSED)
+    chain, me = [robot.make() for _ in range(4)], robot.identity.author
+    agent = listener()
+    hear(agent, *chain[:2])
+    assert questions(agent, Head(me, 9, b"whatever"))[0] == Want(((me, 2, 9),))
+    hear(agent, fleet.revoke(3, robot))
+    assert questions(agent, Head(me, 9, b"whatever"))[0] == Want(((me, 2, 3),))
+    hear(agent, chain[2])
+    assert not questions(agent, Head(me, 9, b"whatever"))
+    late = listener()
+    hear(late, *chain)
+    assert questions(late, Head(me, 4, b"whatever"))[0] == Want(((me, 3, 4),))
+    hear(late, fleet.chain[0])
+    assert not questions(late, Head(me, 4, b"whatever"))
+
+
+def test_proofs_are_asked_for_where_they_can_be_judged() -> None:
+    agent, robot = listener(), Author("a", CLOSED)
+    me = robot.identity.author
+    assert not questions(agent, Head(me, 0, bytes(8), 5))
+    assert questions(agent, Head(me, 0, bytes(8), 0))[0] == Want((), (), (me,))
+    hear(agent, robot.make())
+    assert questions(agent, Head(me, 1, robot.chain[0].id[:8], 5))[0] == Want((), (), (me,))
+
+
+def test_a_stored_proof_is_known_again_after_a_restart() -> None:
+    """It was stored while the author's first transaction still waited for another."""
+    agent, robot, friend = listener(), Author("a", CLOSED), Author("friend", CLOSED)
+    first_one = robot.make(friend.make())
+    left, right = robot.make(keep=False), robot.make(features=1, keep=False)
+    events = hear(agent, first_one, left, right)
+    assert Forked(robot.identity.author, 1) in events
+    log = [event.data for event in events if isinstance(event, Accepted)]
+    assert log == [left.data, right.data]
+    again = Agent.restore(agent.identity, CLOSED, log)
+    assert again.ledger.chain(robot.identity.author).cut == 1
+
+
+def test_what_a_fork_of_the_fleet_key_frees_is_folded_once() -> None:
+    robot, fleet = Author("a", CLOSED), Author(FLEET_KEY, CLOSED)
+    chain = [robot.make() for _ in range(2)]
+    one = fleet.revoke(1, robot, keep=False)
+    other = fleet.revoke(0, Author("b", CLOSED), keep=False)
+    chain.append(robot.make(other))
+    agent, only = listener(), listener()
+    hear(agent, *chain, one)  # the last of the chain waits for the other branch
+    events = hear(agent, other)
+    assert Revoked(robot.identity.author, None) in events
+    hear(only, other, *chain)
+    assert chain[2].id in agent.ledger and chain[2].id in only.ledger
+    assert len(list(agent.consensus.contributions())) == 3
+    assert agent.digest() == only.digest()
 
 
 def test_the_door_shows_the_id_of_what_is_not_kept() -> None:
