@@ -252,6 +252,14 @@ def exchange(
         posts = posts[:late]
 
 
+def until_they_agree(agents: list[Agent], rng: random.Random, loss: float) -> None:
+    """With lost questions and answers it can take a while."""
+    for start in range(0, 400, 40):
+        exchange(agents, rng, loss, 40, start)
+        if counted(agents[0]) == counted(agents[1]) == counted(agents[2]):
+            break
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_loss_and_reordering_are_repaired(seed: int) -> None:
     rng = random.Random(seed)
@@ -269,7 +277,7 @@ def test_loss_and_reordering_are_repaired(seed: int) -> None:
     fleet, lengths[2] = Author(FLEET_KEY, MAPPING), 2
     revocation = fleet.revoke(2, Author("c", MAPPING))
     assert any(isinstance(event, Revoked) for event in agents[1].take(revocation.data))
-    exchange(agents, rng, 0.4, 40)
+    until_they_agree(agents, rng, 0.4)
     assert len({agent.digest() for agent in agents}) == 1
     for robot, length in zip(agents, lengths, strict=True):
         assert {agent.ledger.chain(robot.identity.author).end for agent in agents} == {length}
@@ -435,10 +443,7 @@ def test_robots_that_hold_different_parts_of_it_agree_by_asking(seed: int) -> No
     rng.shuffle(posts)
     for agent, tx in posts:
         hear(agent, tx)
-    for start in range(0, 400, 40):  # until they agree: with lost questions it takes a while
-        exchange(agents, rng, 0.3, 40, start)
-        if counted(agents[0]) == counted(agents[1]) == counted(agents[2]):
-            break
+    until_they_agree(agents, rng, 0.3)
     assert counted(agents[0])
     assert counted(agents[0]) == counted(agents[1]) == counted(agents[2])
     assert len({agent.digest() for agent in agents}) == 1

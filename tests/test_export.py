@@ -111,7 +111,7 @@ LITTLE = "format binary_little_endian 1.0"
         (b"ply\n", "no PLY header"),
         (b"ply\n" * 10_000, "no PLY header"),
         (os.urandom(5000), "no PLY header"),
-        (header("format ascii 1.0", "element vertex 0"), "binary little endian"),
+        (header("format binary_big_endian 1.0", "element vertex 0"), "binary little endian"),
         (header(LITTLE), "vertices do not come first"),
         (header(LITTLE, "element face 3", "element vertex 3"), "vertices do not come first"),
         (header(LITTLE, "element vertex -3"), "vertices do not come first"),

@@ -6,15 +6,15 @@ socket, disk, chance or log in here or below.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 
 from . import messages
 from .config import Config
 from .consensus import Consensus
 from .identity import Identity, certificate_holds
 from .ledger import Ledger
-from .messages import Heads, Transactions
+from .messages import Heads, Message, Transactions
 from .model import (
     FLEET_FRAME,
     Accepted,
@@ -41,6 +41,14 @@ from .wire import Refusal
 from .worldmap import WorldMap, build_map
 
 
+@dataclass(frozen=True, slots=True)
+class Parsers:
+    """How foreign bytes are judged: pure functions, so agents of one process may share results."""
+
+    message: Callable[[bytes, Config], tuple[AuthorId, Message]] = messages.parse
+    transaction: Callable[[bytes, Config], Transaction] = parse
+
+
 class Agent:
     """A robot's share in the fleet's map.
 
@@ -48,8 +56,11 @@ class Agent:
     Raises ConfigError where the fleet is closed and the identity has no certificate of it.
     """
 
-    def __init__(self, identity: Identity, config: Config | None = None) -> None:
+    def __init__(
+        self, identity: Identity, config: Config | None = None, parsers: Parsers | None = None
+    ) -> None:
         self.config = config or Config()
+        self._parsers = parsers or Parsers()
         self.identity = identity
         _check_certificate(identity, self.config)
         self.ledger = Ledger(self.config)
@@ -61,14 +72,18 @@ class Agent:
 
     @classmethod
     def restore(
-        cls, identity: Identity, config: Config | None, transactions: Iterable[bytes]
+        cls,
+        identity: Identity,
+        config: Config | None,
+        transactions: Iterable[bytes],
+        parsers: Parsers | None = None,
     ) -> Agent:
         """An agent that holds these transactions (as `Accepted` gave them) and goes on.
 
         Its adjacency DAG and the ids of the SLAM are those of a new start: where the SLAM was
         started anew too, give its cycles a new session.
         """
-        agent = cls(identity, config)
+        agent = cls(identity, config, parsers)
         for data in transactions:
             agent._through_the_door(data, again=True)
         agent.observing.resume(agent.ledger.chain(identity.author).main)
@@ -85,7 +100,7 @@ class Agent:
     def receive(self, data: bytes, now: float) -> list[Event]:
         """Take any message of any robot. Foreign bytes never raise: they are `Rejected`."""
         try:
-            sender, message = messages.parse(bytes(data), self.config)
+            sender, message = self._parsers.message(bytes(data), self.config)
         except Refusal as refusal:
             return [Rejected(refusal.reason, refusal.fault, refusal.detail)]
         if isinstance(message, Transactions):
@@ -200,7 +215,7 @@ class Agent:
                 author, previous = glance(data)
                 if previous and not self.ledger.worth_judging(id_, author):
                     return [Waiting(id_, (previous,))]
-            transaction = parse(data, self.config)
+            transaction = self._parsers.transaction(data, self.config)
         except Refusal as refusal:
             return [Rejected(refusal.reason, refusal.fault, refusal.detail)]
         outcome = self.ledger.add(transaction, again)

@@ -190,6 +190,10 @@ class AdjacencyDag:
         """
         return np.maximum(self._parents_of(self._rows(ids)), -1).astype(np.int64)
 
+    def parents_taken(self, ids: npt.ArrayLike | None = None) -> Int64s:
+        """(N,) number of parents, lattice nodes included."""
+        return np.asarray((self._parents_of(self._rows(ids)) != -1).sum(axis=1), np.int64)
+
     def validity(self, ids: npt.ArrayLike | None = None) -> Int64s:
         """(N,) v of Eq. (1), saturating at the largest int64; 0 for a feature that has left."""
         values: Int64s = self._validity[self._rows(ids)]

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -58,12 +59,21 @@ class Outcome:
     missing: tuple[TransactionId, ...] | None = None  # the transaction waits for these
 
 
+class Sizes(NamedTuple):
+    """What a ledger holds."""
+
+    accepted: int
+    waiting: int
+    waiting_bytes: int
+
+
 class Ledger:
     """The transactions that a robot holds. `add` is the only way in."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
         self.chains: dict[AuthorId, Chain] = {}
+        self.changed: set[AuthorId] = set()  # whose chain did, since its reader cleared this
         self._known: dict[TransactionId, Transaction] = {}
         self._features: dict[TransactionId, int] = {}  # the author's features up to and with it
         self._waiting: OrderedDict[TransactionId, tuple[Transaction, set[TransactionId]]]
@@ -85,6 +95,9 @@ class Ledger:
     def __iter__(self) -> Iterator[Transaction]:
         """All accepted transactions, each after everything that it refers to."""
         return iter(self._known.values())
+
+    def sizes(self) -> Sizes:
+        return Sizes(len(self._known), len(self._waiting), self._waiting_size)
 
     def holds(self, id_: TransactionId) -> bool:
         """Whether it is accepted or waiting, so that it need not be looked at again."""
@@ -221,6 +234,7 @@ class Ledger:
 
     def _accept(self, tx: Transaction) -> None:
         chain = self.chains.setdefault(tx.author, Chain())
+        self.changed.add(tx.author)
         before = 0 if tx.previous is None else self._features[tx.previous]
         self._known[tx.id] = tx
         self._features[tx.id] = before + tx.features
@@ -266,6 +280,7 @@ class Ledger:
             if chain.revoked != counts.get(author):
                 chain.revoked = counts.get(author)
                 outcome.revoked.append((author, chain.revoked))
+                self.changed.add(author)
 
     def _note_fork(self, tx: Transaction, outcome: Outcome) -> None:
         """Two self-valid transactions with one number are the proof, whatever else is known."""
@@ -274,6 +289,7 @@ class Ledger:
         if rival is not None and (chain.cut is None or tx.sequence < chain.cut):
             chain = self.chains.setdefault(tx.author, chain)
             chain.cut, chain.proof = tx.sequence, (rival, tx)
+            self.changed.add(tx.author)
             outcome.forked.append((tx.author, tx.sequence))
 
     def _rival(self, chain: Chain, tx: Transaction) -> Transaction | None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import zlib
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from . import wire
 from .config import Config
@@ -42,8 +42,7 @@ class Transactions:
     more: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Head:
+class Head(NamedTuple):
     """The end of an author's chain as the sender holds it; `cut` where it holds a fork proof."""
 
     author: AuthorId
@@ -102,6 +101,17 @@ def parse(data: bytes, config: Config) -> tuple[AuthorId, Message]:
         return sender, _decode_body(data[3], Reader(data[_HEAD:-4]), config)
     except Refusal as refusal:
         raise Refusal(refusal.reason, refusal.detail, sender) from None
+
+
+def kind_of(data: bytes) -> Kind | None:
+    """The kind that a message's head names, before anything of it is checked."""
+    kind = data[3] if len(data) > 3 else 0
+    return Kind(kind) if kind in Kind.__members__.values() else None
+
+
+def sender_of(data: bytes) -> AuthorId:
+    """The sender that a message's head names: a hint. Shorter than 8 bytes where it is cut."""
+    return data[_HEAD - 8 : _HEAD]
 
 
 def _encode_body(message: Message) -> tuple[Kind, bytes]:

@@ -135,6 +135,10 @@ class Observing:
         if cycle.ids is not None:
             self._nodes.update(zip(cycle.ids[order].tolist(), nodes.tolist(), strict=True))
 
+    def node_of(self, id_: int) -> int:
+        """The node of an id that the SLAM gave; -1 where it is unknown or has left."""
+        return self._nodes.get(id_, -1)
+
     @property
     def waiting(self) -> bool:
         """Whether something is to be sent sooner or later."""

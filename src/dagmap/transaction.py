@@ -76,6 +76,11 @@ def id_of(data: bytes) -> TransactionId:
     return hashlib.blake2b(data, digest_size=32).digest()
 
 
+def signed_part(data: bytes, config: Config) -> bytes:
+    """What the signature at the end of a transaction's bytes covers."""
+    return _SIGNED + config.fleet_id + data[:-64]
+
+
 def seal(
     identity: Identity,
     config: Config,
@@ -150,7 +155,7 @@ def _parse(
         certificate, config.fleet_public_key, config.fleet_id, public_key
     ):
         raise Refusal(Reason.CERTIFICATE, "the fleet key has not signed it for this robot")
-    if not signature_holds(public_key, signature, _SIGNED + config.fleet_id + data[:-64]):
+    if not signature_holds(public_key, signature, signed_part(data, config)):
         raise Refusal(Reason.SIGNATURE)
     payload = decode_payload(body, config.graph.n_p)
     _check_standing(payload, sequence, public_key, config)

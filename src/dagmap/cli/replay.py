@@ -32,9 +32,10 @@ from ..io.figures import (
 from ..io.report import write_report
 from ..io.sources import Source, open_source
 from ..io.store import Store
-from ..model import Accepted, Cycle, DagmapError, Event, Floats, State
-from ..sim.fleet import Fleet, Robot
-from ..sim.network import Link
+from ..model import Accepted, Cycle, DagmapError, Floats, State
+from ..sim.fleet import Fleet
+from ..sim.network import Link, Network
+from ..sim.robot import Happening, Robot
 from ..worldmap import WorldMap
 from .kernels import warm_up
 
@@ -77,7 +78,7 @@ class Replay:
         prepare_out(self.out, self.force)
         started = time.perf_counter()
         warm_up(self.console)
-        fleet = Fleet(config, Link(loss=self.loss), self.seed, self._store)
+        fleet = Fleet(config, Network(Link(loss=self.loss), self.seed), self._store)
         try:
             self._play(fleet, sources)
             summary = self._write(fleet, config, started)
@@ -129,7 +130,7 @@ class Replay:
             track.points.append(points @ pose[:3, :3].T + pose[:3, 3])
             yield cycle
 
-    def _store(self, robot: Robot, event: Event) -> None:
+    def _store(self, robot: Robot, event: Happening) -> None:
         """A transaction is on disk before anyone is told of it."""
         if not isinstance(event, Accepted):
             return

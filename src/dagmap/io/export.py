@@ -15,7 +15,8 @@ from typing import Any, BinaryIO, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from ..model import Bools, Floats, Int64s, OutputError, RecordingError, Uint8s
+from ..model import Bools, Floats, Int64s, OutputError, Uint8s
+from .ply import read_vertices
 
 # What `replay` writes, and so what --force may remove.
 REPLAY_FILES = ("summary.json", "map.ply", "maps.png", "traffic.png", "report.html")
@@ -46,25 +47,6 @@ _HEADER = "\n".join(
         "end_header\n",
     ]
 )
-_CODES = {  # every scalar type that a PLY header may name
-    b"char": "i1",
-    b"int8": "i1",
-    b"uchar": "u1",
-    b"uint8": "u1",
-    b"short": "<i2",
-    b"int16": "<i2",
-    b"ushort": "<u2",
-    b"uint16": "<u2",
-    b"int": "<i4",
-    b"int32": "<i4",
-    b"uint": "<u4",
-    b"uint32": "<u4",
-    b"float": "<f4",
-    b"float32": "<f4",
-    b"double": "<f8",
-    b"float64": "<f8",
-}
-_MAX_LINE = 1000  # bytes of a header line
 
 
 class MapLike(Protocol):
@@ -128,53 +110,18 @@ def write_ply(path: Path, world: MapLike) -> None:
 
 
 def read_ply(path: Path) -> PlyMap:
-    """Read a `map.ply`, also one that another program has saved again in binary little endian.
+    """Read a `map.ply`, also one that another program has saved again.
 
     Raises RecordingError naming the file and what is wrong.
     """
-    try:
-        with open(path, "rb") as file:
-            dtype, count = _read_header(path, file)
-            body = file.read(min(count * dtype.itemsize, os.fstat(file.fileno()).st_size))
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read ({error.strerror}); check the path") from None
-    if len(body) < count * dtype.itemsize:
-        raise _damaged(path, f"{count} nodes are promised, {len(body) // dtype.itemsize} are there")
-    vertices = np.frombuffer(body, dtype)
+    names = [name for name, _, _ in _VERTEX]
+    vertices = read_vertices(path, names, "give a map.ply that DAGmap wrote")
     return PlyMap(
         np.stack([vertices[name].astype(np.float64) for name in ("x", "y", "z")], axis=1),
         np.stack([vertices[name].astype(np.uint8) for name in ("red", "green", "blue")], axis=1),
         vertices["state"].astype(np.uint8),
         *(vertices[name].astype(np.int64) for name in ("hits", "misses", "witnesses")),
     )
-
-
-def _read_header(path: Path, file: BinaryIO) -> tuple[np.dtype[np.void], int]:
-    """The layout and number of vertices; leaves the file at the first vertex."""
-    lines = [file.readline(_MAX_LINE).split()]
-    while lines[0] == [b"ply"] and lines[-1] not in ([b"end_header"], []) and len(lines) < 200:
-        lines.append(file.readline(_MAX_LINE).split())
-    if lines[-1] != [b"end_header"]:
-        raise _damaged(path, "it has no PLY header")
-    if [b"format", b"binary_little_endian", b"1.0"] not in lines:
-        raise _damaged(path, "it is not in binary little endian")
-    elements = [line for line in lines if line[0] == b"element"]
-    if not elements or elements[0][1:2] != [b"vertex"] or not elements[0][-1].isdigit():
-        raise _damaged(path, "the vertices do not come first")
-    end = lines.index(elements[1]) if len(elements) > 1 else len(lines)
-    fields = [line[1:] for line in lines[:end] if line[0] == b"property"]
-    if any(len(field) != 2 or field[0] not in _CODES for field in fields):
-        raise _damaged(path, "its vertices hold something else than numbers")
-    names = [field[1].decode("ascii", "replace") for field in fields]
-    missing = [name for name, _, _ in _VERTEX if names.count(name) != 1]
-    if missing or len(set(names)) != len(names):
-        raise _damaged(path, f"its vertices lack {', '.join(missing) or 'unique names'}")
-    dtype = np.dtype([(name, _CODES[kind]) for name, (kind, _) in zip(names, fields, strict=True)])
-    return dtype, int(elements[0][-1][:15])
-
-
-def _damaged(path: Path, what: str) -> RecordingError:
-    return RecordingError(f"{path}: no usable map: {what}; give a map.ply that DAGmap wrote")
 
 
 def write_graph_npz(

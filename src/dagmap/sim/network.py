@@ -1,53 +1,124 @@
-"""A network that loses, delays and reorders, from a seed."""
+"""A radio that loses, delays, repeats, queues and splits, from a seed."""
 
 from __future__ import annotations
 
-import heapq
+import math
 import random
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from typing import Literal, TypeAlias
+
+import msgspec
+
+from ..model import ConfigError
+
+Position: TypeAlias = tuple[float, float, float]
+Where: TypeAlias = Callable[[str, float], Position]  # of a robot at a time, metres
 
 
-@dataclass(frozen=True, slots=True)
-class Link:
-    """How the network treats a message on its way to one robot."""
+class Link(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How the network treats a message on its way to one robot. Times in s, sizes in bytes."""
 
     loss: float = 0.0  # probability that it never arrives
-    delay: tuple[float, float] = (0.002, 0.02)  # s, uniform; overlapping ones arrive reordered
+    delay: tuple[float, float] = (0.002, 0.02)  # uniform; overlapping ones arrive reordered
+    tail: float = 0.0  # mean of an exponential delay on top: what bad Wi-Fi adds
+    duplicate: float = 0.0  # probability that it arrives twice
+    reach: float | None = None  # m: robots further apart do not hear each other
+    bandwidth: float | None = None  # bytes/s that one robot can send
+    queue: int = 1 << 20  # bytes that wait for their turn at most; the rest is dropped
 
     def __post_init__(self) -> None:
-        if not 0 <= self.loss < 1:
-            raise ValueError(f"loss {self.loss}: a probability from 0 up to, not including, 1")
-        if not 0 <= self.delay[0] <= self.delay[1]:
-            raise ValueError(f"delay {self.delay}: two times in s, the shorter first")
+        self._require(0 <= self.loss < 1, "loss", "a probability from 0 up to, not including, 1")
+        self._require(0 <= self.delay[0] <= self.delay[1], "delay", "two times, the shorter first")
+        self._require(0 <= self.tail < math.inf, "tail", "a time of at least 0")
+        self._require(0 <= self.duplicate <= 1, "duplicate", "a probability")
+        self._require(self.reach is None or self.reach > 0, "reach", "a distance above 0")
+        self._require(self.bandwidth is None or self.bandwidth > 0, "bandwidth", "above 0 bytes/s")
+        self._require(self.queue >= 0, "queue", "at least 0 bytes")
+
+    def _require(self, holds: bool, name: str, wanted: str) -> None:
+        if not holds:
+            raise ConfigError(f"Link: {name} = {getattr(self, name)!r}, but {wanted} is wanted")
+
+
+class Partition(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """From `start` to `end` (s) these robots and all others do not hear each other.
+
+    direction: "out": the others do not hear them; "in": they do not hear the others.
+    """
+
+    start: float
+    end: float
+    robots: tuple[str, ...]
+    direction: Literal["both", "in", "out"] = "both"
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.start <= self.end:
+            raise ConfigError(f"partition from {self.start} s to {self.end} s: the end comes first")
+
+    def cuts(self, sender: str, receiver: str, now: float) -> bool:
+        if not self.start <= now < self.end:
+            return False
+        a, b = sender in self.robots, receiver in self.robots
+        if self.direction == "out":
+            return a and not b
+        return b and not a if self.direction == "in" else a != b
 
 
 class Network:
-    """Carries bytes between named robots on a clock that the caller owns."""
+    """Says when, and whether, a message reaches whom. The caller owns the clock.
 
-    def __init__(self, link: Link, seed: int) -> None:
-        self._link = link
+    where: position of a robot, needed where the link has a reach.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        seed: int,
+        partitions: Iterable[Partition] = (),
+        where: Where | None = None,
+    ) -> None:
+        if link.reach is not None and where is None:
+            raise ConfigError("Link: a reach is given, but nobody says where the robots are")
+        self._link, self._partitions, self._where = link, tuple(partitions), where
         self._random = random.Random(seed)
-        self._flight: list[tuple[float, int, str, bytes]] = []
-        self._sent = 0
+        self._free_at: dict[str, float] = {}  # when a robot's radio has sent what it holds
+        self.dropped = 0  # messages that met a full queue
 
-    def __len__(self) -> int:
-        return len(self._flight)
+    def connects(self, sender: str, receiver: str, now: float) -> bool:
+        """Whether one robot hears another."""
+        if any(partition.cuts(sender, receiver, now) for partition in self._partitions):
+            return False
+        if self._link.reach is None or self._where is None:
+            return True
+        return math.dist(self._where(sender, now), self._where(receiver, now)) <= self._link.reach
 
-    @property
-    def next_arrival(self) -> float | None:
-        return self._flight[0][0] if self._flight else None
+    def send(
+        self, sender: str, receivers: Iterable[str], size: int, now: float
+    ) -> list[tuple[float, str]]:
+        """(time of arrival, receiver) of every copy that arrives. A broadcast is sent once."""
+        leaves = self._transmit(sender, size, now)
+        if leaves is None:
+            return []
+        link, chance = self._link, self._random
+        copies = []
+        for receiver in receivers:
+            if not self.connects(sender, receiver, now):
+                continue
+            for _ in range(1 + (link.duplicate > 0 and chance.random() < link.duplicate)):
+                delay = chance.uniform(*link.delay)
+                if link.tail:
+                    delay += chance.expovariate(1 / link.tail)
+                if link.loss == 0 or chance.random() >= link.loss:
+                    copies.append((leaves + delay, receiver))
+        return copies
 
-    def send(self, to: str, data: bytes, now: float) -> None:
-        """Put one message for one robot on its way, or lose it."""
-        delay = self._random.uniform(*self._link.delay)
-        if self._random.random() >= self._link.loss:
-            self._sent += 1
-            heapq.heappush(self._flight, (now + delay, self._sent, to, data))
-
-    def arrivals(self, now: float) -> list[tuple[str, bytes]]:
-        """What has arrived by now, in order of arrival."""
-        out = []
-        while self._flight and self._flight[0][0] <= now:
-            _, _, to, data = heapq.heappop(self._flight)
-            out.append((to, data))
-        return out
+    def _transmit(self, sender: str, size: int, now: float) -> float | None:
+        """When the last byte has left the robot's radio; None where its queue is full."""
+        if self._link.bandwidth is None:
+            return now
+        start = max(now, self._free_at.get(sender, now))
+        if (start - now) * self._link.bandwidth > self._link.queue:
+            self.dropped += 1
+            return None
+        self._free_at[sender] = start + size / self._link.bandwidth
+        return self._free_at[sender]

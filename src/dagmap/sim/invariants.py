@@ -1,0 +1,209 @@
+"""What must hold after every event of every run. `Violation` says what did not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..agent import Agent
+from ..consensus import Consensus
+from ..graph import AdjacencyDag
+from ..identity import signature_holds
+from ..model import AuthorId, Int64s, State, TransactionId
+from ..sync import MAX_PEERS
+from ..transaction import Transaction, signed_part
+from .fleet import Fleet
+from .robot import Happening, Observed, Robot
+from .truth import transactions_anew
+
+_EVERY = 200  # events of a robot between two looks at the whole map
+_MOST = np.iinfo(np.int64).max
+
+
+class Violation(Exception):
+    """A promise was broken: which one, by which robot, when."""
+
+    def __init__(self, name: str, robot: str, at: float, detail: str) -> None:
+        super().__init__(f"{name}: {robot} at {at:.3f} s: {detail}")
+        self.name = name
+
+
+@dataclass(slots=True)
+class _Looked:
+    """What of one robot's process was found good already."""
+
+    agent: Agent
+    events: int = 0
+    held: int = 0  # transactions
+    chains: dict[AuthorId, int] = field(default_factory=dict)
+
+
+class Invariants:
+    """Call it after every event with the robot that it concerned, and `at_the_end` once.
+
+    `saw` is told of everything that happens (a fleet's `on_event`).
+    """
+
+    def __init__(self) -> None:
+        self.fleet: Fleet | None = None
+        self._looked: dict[str, _Looked] = {}
+        self._observed: set[str] = set()
+        self._signed: set[TransactionId] = set()
+        self._robot = ""
+
+    def saw(self, robot: Robot, happening: Happening) -> None:
+        if isinstance(happening, Observed):
+            self._observed.add(robot.name)
+
+    def __call__(self, robot: Robot) -> None:
+        if not robot.honest:
+            return
+        self._robot = robot.name
+        looked = self._looked.get(robot.name)
+        if looked is None or looked.agent is not robot.agent:  # it was restarted
+            self._nothing_lost(robot)
+            looked = self._looked[robot.name] = _Looked(robot.agent)
+        looked.events += 1
+        self._bounds(robot.agent)
+        self._ledger(robot.agent, looked)
+        if robot.name in self._observed:
+            self._observed.discard(robot.name)
+            self._graph(robot.agent.observing.graph, robot.agent.config.graph.n_c)
+        if looked.events % _EVERY == 0:
+            self._map(robot.agent)
+
+    def at_the_end(self, honest: list[Robot]) -> None:
+        """The fleet had its time to agree."""
+        digests = {}
+        for robot in honest:
+            self._robot = robot.name
+            digests[robot.name] = robot.agent.digest()
+            self._withdrawn(robot, honest)
+            chain = honest[0].agent.ledger.chain(robot.author)
+            self._require(
+                {tx.id for tx in chain.main} >= robot.own & set(map(_id, robot.agent.ledger)),
+                "a transaction was forgotten",
+                f"{honest[0].name} lacks some of {robot.name}'s",
+            )
+        self._map(honest[0].agent)
+        self._require(
+            len(set(digests.values())) == 1,
+            "the maps differ",
+            ", ".join(f"{name} {digest.hex()[:8]}" for name, digest in digests.items()),
+        )
+
+    def _require(self, holds: bool, name: str, detail: str) -> None:
+        if not holds:
+            now = self.fleet.now if self.fleet is not None else 0.0
+            raise Violation(name, self._robot, now, detail)
+
+    def _nothing_lost(self, robot: Robot) -> None:
+        """What was stored and told of is there after a restart, and the own chain goes on."""
+        held = {tx.id for tx in robot.agent.ledger}
+        told = self._told_of(robot)
+        self._require(told <= held, "a restart lost what others hold", f"{len(told - held)} lost")
+
+    def _told_of(self, robot: Robot) -> set[TransactionId]:
+        """Transactions of a robot that others hold."""
+        others = self.fleet.robots.values() if self.fleet is not None else ()
+        return {
+            tx.id
+            for other in others
+            if other is not robot and other.up
+            for tx in other.agent.ledger.chain(robot.author).main
+        } & robot.own
+
+    def _bounds(self, agent: Agent) -> None:
+        """Nothing that others can fill grows without end."""
+        limits, sizes = agent.config.ledger, agent.ledger.sizes()
+        self._require(sizes.waiting <= limits.waiting_transactions, "memory", f"{sizes}")
+        self._require(sizes.waiting_bytes <= limits.waiting_bytes, "memory", f"{sizes}")
+        self._require(len(agent.sync.peers) <= MAX_PEERS, "memory", "peers")
+
+    def _ledger(self, agent: Agent, looked: _Looked) -> None:
+        """Chains are unbroken, dated as they must be, and signed; nothing leaves."""
+        ledger = agent.ledger
+        self._require(len(ledger) >= looked.held, "a transaction was forgotten", f"{len(ledger)}")
+        looked.held = len(ledger)
+        for author, chain in ledger.chains.items():
+            first = looked.chains.get(author, 0)
+            self._require(len(chain.main) >= first, "a transaction was forgotten", author.hex())
+            for i in range(first, len(chain.main)):
+                self._transaction(agent, chain.main, i, author)
+            looked.chains[author] = len(chain.main)
+
+    def _transaction(self, agent: Agent, main: list[Transaction], i: int, author: AuthorId) -> None:
+        tx = main[i]
+        previous = main[i - 1].id if i else None
+        unbroken = tx.author == author and tx.sequence == i and tx.previous == previous
+        self._require(unbroken, "a chain is broken", repr(tx))
+        known = [agent.ledger.find(id_) for id_ in tx.refers_to]
+        dates = [other.lamport for other in known if other is not None]
+        self._require(len(dates) == len(known), "a reference is unknown", repr(tx))
+        self._require(tx.lamport == 1 + max(dates, default=0), "a Lamport time is false", repr(tx))
+        if tx.id not in self._signed:
+            signature, signed = tx.data[-64:], signed_part(tx.data, agent.config)
+            holds = signature_holds(tx.data[1:33], signature, signed)
+            self._require(holds, "a signature is false", repr(tx))
+            self._signed.add(tx.id)
+
+    def _graph(self, graph: AdjacencyDag, n_c: int) -> None:
+        """Acyclic, at most N_c children, E as it must be, validity the sum of the parents'."""
+        parents, taken = graph.parents(), graph.parents_taken()
+        ids, here = np.arange(len(graph)), graph.alive() | graph.issued()
+        self._require(bool((parents < ids[:, None]).all()), "the graph has a cycle", "")
+        counted = np.bincount(parents[parents >= 0], minlength=len(graph))
+        children = graph.children_count()
+        self._require(bool((counted == children)[here].all()), "children are miscounted", "")
+        self._require(
+            bool((children <= n_c).all()), "too many children", f"{children.max(initial=0)}"
+        )
+        terminals = np.flatnonzero(graph.alive() & (counted < n_c))
+        self._require(np.array_equal(graph.terminals(), terminals), "E is wrong", "")
+        wanted = self._validity(graph, parents, taken)
+        self._require(np.array_equal(graph.validity()[here], wanted[here]), "validity", "")
+
+    @staticmethod
+    def _validity(graph: AdjacencyDag, parents: Int64s, taken: Int64s) -> Int64s:
+        """Eq. (1) from the parents' values, saturating."""
+        values = graph.validity()
+        of_features = np.where(parents >= 0, values[parents], 0).astype(object).sum(axis=1)
+        lattice = taken - (parents >= 0).sum(axis=1)
+        sums = np.minimum(of_features + lattice, _MOST)
+        return np.asarray(np.where(taken == 0, 1, sums), np.int64)
+
+    def _map(self, agent: Agent) -> None:
+        """The fold is that of the set from scratch; nothing is confirmed without witnesses."""
+        scratch = Consensus(agent.config)
+        for tx in transactions_anew(agent):
+            scratch.add(tx)
+        self._require(
+            agent.digest() == scratch.digest(), "the fold is not that of the set", f"{agent.ledger}"
+        )
+        world = agent.map
+        few = world.witnesses < agent.config.fold.witnesses
+        self._require(
+            not bool((few & (world.states == State.CONFIRMED)).any()),
+            "confirmed without witnesses",
+            repr(world),
+        )
+
+    def _withdrawn(self, robot: Robot, honest: list[Robot]) -> None:
+        """What a robot's SLAM has withdrawn is in nobody's map."""
+        if not len(robot.withdrawn):
+            return
+        for other in honest:
+            fold = other.agent.consensus
+            nodes = fold.feature_nodes(other.agent.map.origin, fold.author(robot.author))
+            numbers = np.array(sorted(robot.withdrawn), np.int64)
+            alive = nodes[numbers[numbers < len(nodes)]] >= 0
+            self._require(
+                not bool(alive.any()),
+                "a retraction was lost",
+                f"{other.name} holds {int(alive.sum())} points that {robot.name} withdrew",
+            )
+
+
+def _id(tx: Transaction) -> TransactionId:
+    return tx.id

@@ -1,0 +1,284 @@
+"""Robots that do not keep to the rules. Each holds a valid key and an otherwise honest agent.
+
+A liar stands between its SLAM and its agent (`cycle`) and between its agent and the network
+(`send`); what it does follows from its seed.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from .. import messages, transaction
+from ..agent import Agent
+from ..identity import Identity
+from ..messages import Head, Heads, Transactions
+from ..model import ConfigError, Cycle, Floats, Outgoing
+from ..payload import Payload
+
+_BURST = 20  # messages that a noisy liar adds to each step in which it sends
+
+
+class Honest:
+    """Tells and sends what it should: the base of all liars."""
+
+    def __init__(self, seed: int) -> None:
+        self.random = random.Random(seed)
+
+    def cycle(self, cycle: Cycle, now: float) -> Cycle:
+        return cycle
+
+    def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:
+        return outgoing
+
+
+class Forger(Honest):
+    """Invents a wall: adds points of one that is not there to every cycle."""
+
+    WALL = ((1.0, 1.0, 0.2), (1.0, 3.0, 2.0))  # m, corners in the fleet frame
+
+    def cycle(self, cycle: Cycle, now: float) -> Cycle:
+        wall = np.array([[self.random.uniform(a, b) for a, b in zip(*self.WALL, strict=True)]
+                         for _ in range(30)])  # fmt: skip
+        return _with_points(cycle, np.concatenate([_points(cycle), _into_sensor(cycle, wall)]))
+
+
+class Eraser(Honest):
+    """Says of every point that it lies far behind where it is, so that rays cross what is real."""
+
+    def cycle(self, cycle: Cycle, now: float) -> Cycle:
+        return _with_points(cycle, _points(cycle) * 1.5)
+
+
+class Splitter(Honest):
+    """Surrounds what it sees with copies, so that the observations of others find many twins."""
+
+    def cycle(self, cycle: Cycle, now: float) -> Cycle:
+        points = _points(cycle)
+        around = [[self.random.uniform(-0.06, 0.06) for _ in range(3)] for _ in range(6)]
+        copies = [points + np.array(offset) for offset in around]
+        return _with_points(cycle, np.concatenate([points, *copies]))
+
+
+class WrongFrame(Honest):
+    """Is half a metre and ten degrees from where it believes to be."""
+
+    def cycle(self, cycle: Cycle, now: float) -> Cycle:
+        c, s = np.cos(np.radians(10)), np.sin(np.radians(10))
+        wrong = np.array([[c, -s, 0, 0.3], [s, c, 0, -0.4], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+        moved = cycle.moved
+        if moved is not None:
+            moved = (moved[0], wrong @ np.asarray(moved[1], np.float64))
+        return replace(cycle, pose=wrong @ np.asarray(cycle.pose, np.float64), moved=moved)
+
+
+class Forker(Honest):
+    """Signs a second transaction with the same number and shows each half of the fleet one."""
+
+    def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:
+        out = list(outgoing)
+        for sent in outgoing:
+            for tx in _own(agent, sent):
+                rival = _sealed(agent, tx.sequence, tx.previous, tx.lamport, tx.references)
+                others = sorted(agent.sync.peers)
+                out += [_packed(agent, rival, whom) for whom in others[::2]]
+        return out
+
+
+class BackDater(Honest):
+    """Refers to nobody, so that all it says sorts before what the others say at the time."""
+
+    def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:
+        vars(agent.ledger)["tips"] = lambda me, most: ()
+        return outgoing
+
+
+class FalseDater(Honest):
+    """Claims Lamport times that do not follow from its references, low and high."""
+
+    def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:
+        out = []
+        for sent in outgoing:
+            own = _own(agent, sent)
+            for tx in own:
+                false = self.random.choice([1, max(1, tx.lamport - 1), tx.lamport + 1, 1 << 40])
+                if false != tx.lamport:
+                    args = (tx.sequence, tx.previous, false, tx.references)
+                    out.append(_packed(agent, _sealed(agent, *args)))
+            if not own:
+                out.append(sent)
+        return out
+
+
+class Flooder(Honest):
+    """Sends transactions without end that refer to what does not exist, to fill every room."""
+
+    def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:
+        if not outgoing:
+            return outgoing
+        junk = (
+            _sealed(agent, self.random.randrange(1000, 1 << 30), self.random.randbytes(32), 7, ())
+            for _ in range(_BURST)
+        )
+        return outgoing + [_packed(agent, data) for data in junk]
+
+
+class Replayer(Honest):
+    """Sends everything that it ever sent again and again."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed)
+        self._sent: list[Outgoing] = []
+
+    def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:
+        self._sent += outgoing
+        if not outgoing:
+            return outgoing
+        return outgoing + [self.random.choice(self._sent) for _ in range(_BURST)]
+
+
+class WrongProver(Honest):
+    """Spoils signatures and proofs of work, and speaks in the name of others."""
+
+    def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:
+        out = list(outgoing)
+        for sent in outgoing:
+            for tx in _own(agent, sent):
+                spoilt = bytearray(tx.data)
+                spoilt[-self.random.randrange(1, 69)] ^= 1 << self.random.randrange(8)
+                out.append(_packed(agent, bytes(spoilt)))
+        return out + [_packed(agent, data) for data in self._in_the_name_of_others(agent)]
+
+    def _in_the_name_of_others(self, agent: Agent) -> Iterator[bytes]:
+        """Continues the chain of another robot, with its public key and a signature of its own."""
+        victims = sorted(a for a in agent.ledger.chains if a != agent.identity.author)
+        if not victims or self.random.random() > 0.2:
+            return
+        last = agent.ledger.chain(self.random.choice(victims)).main[-1]
+        args = (last.sequence + 1, last.id, last.lamport + 1, ())
+        yield _sealed(agent, *args, Impostor(agent.identity, last.data[1:33]))
+
+
+class Impostor(Identity):
+    """Signs with one key and shows another."""
+
+    def __init__(self, true: Identity, shown: bytes) -> None:
+        self._true = true
+        self.public_key, self.author = shown, true.author
+
+    def sign(self, message: bytes) -> bytes:
+        return self._true.sign(message)
+
+
+class Babbler(Honest):
+    """Random bytes, and messages with random bytes changed."""
+
+    def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:
+        out = list(outgoing)
+        for sent in outgoing:
+            out.append(Outgoing(self.random.randbytes(self.random.randrange(200))))
+            spoilt = bytearray(sent.data)
+            for _ in range(self.random.randrange(1, 4)):
+                spoilt[self.random.randrange(len(spoilt))] = self.random.randrange(256)
+            out.append(Outgoing(bytes(spoilt)))
+        return out
+
+
+class Withholder(Honest):
+    """Announces its own transactions, shows them to one robot only and answers no question."""
+
+    def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:
+        friend = min(agent.sync.peers, default=None)
+        out = []
+        for sent in outgoing:
+            told = isinstance(messages.parse(sent.data, agent.config)[1], Transactions)
+            if not told:
+                out.append(sent)
+            elif friend is not None:
+                out.append(Outgoing(sent.data, friend))
+        return out
+
+
+class Braggart(Honest):
+    """Announces chains that nobody has."""
+
+    def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:
+        if not outgoing:
+            return outgoing
+        heads = tuple(
+            Head(author, chain.end + self.random.randrange(1, 1 << 20), self.random.randbytes(8))
+            for author, chain in agent.ledger.chains.items()
+        )
+        invented = Head(self.random.randbytes(8), self.random.randrange(1, 99), bytes(8))
+        boast = Heads(self.random.randrange(1 << 30), (), (*heads, invented))
+        data = messages.encode(boast, agent.config, agent.identity.author)
+        return [*outgoing, Outgoing(data)]
+
+
+LIARS: dict[str, type[Honest]] = {
+    "forger": Forger,
+    "eraser": Eraser,
+    "splitter": Splitter,
+    "wrong-frame": WrongFrame,
+    "forker": Forker,
+    "back-dater": BackDater,
+    "false-dater": FalseDater,
+    "flooder": Flooder,
+    "replayer": Replayer,
+    "wrong-prover": WrongProver,
+    "babbler": Babbler,
+    "withholder": Withholder,
+    "braggart": Braggart,
+}
+
+
+def make_liar(kind: str, seed: int) -> Honest:
+    """A liar by its name. Raises ConfigError with the names that there are."""
+    if kind not in LIARS:
+        raise ConfigError(f"liar {kind!r} is unknown; one of {', '.join(sorted(LIARS))} is wanted")
+    return LIARS[kind](seed)
+
+
+def _own(agent: Agent, sent: Outgoing) -> list[transaction.Transaction]:
+    """The liar's own transactions in a message that it broadcasts."""
+    _, parsed = messages.parse(sent.data, agent.config)
+    if not isinstance(parsed, Transactions) or sent.to is not None:
+        return []
+    held = (agent.ledger.find(transaction.id_of(data)) for data in parsed.data)
+    return [tx for tx in held if tx is not None and tx.author == agent.identity.author]
+
+
+def _sealed(
+    agent: Agent,
+    sequence: int,
+    previous: bytes | None,
+    lamport: int,
+    references: tuple[bytes, ...],
+    identity: Identity | None = None,
+) -> bytes:
+    """An empty transaction with these numbers."""
+    signer = identity or agent.identity
+    args = (sequence, previous, lamport, references, Payload())
+    return transaction.seal(signer, agent.config, *args)
+
+
+def _packed(agent: Agent, data: bytes, to: bytes | None = None) -> Outgoing:
+    me = agent.identity.author
+    return Outgoing(messages.encode(Transactions((data,)), agent.config, me), to)
+
+
+def _points(cycle: Cycle) -> Floats:
+    return np.asarray(cycle.points, np.float64).reshape(-1, 3)
+
+
+def _into_sensor(cycle: Cycle, points: Floats) -> Floats:
+    pose = np.asarray(cycle.pose, np.float64)
+    return np.asarray((points - pose[:3, 3]) @ pose[:3, :3])
+
+
+def _with_points(cycle: Cycle, points: Floats) -> Cycle:
+    """The cycle with other points, which no longer have ids or colours."""
+    return replace(cycle, points=points, ids=None, colors=None, removed=None)
