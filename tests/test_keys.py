@@ -17,8 +17,10 @@ from typer.testing import CliRunner, Result
 from dagmap import Agent, Config, Cycle, GraphConfig
 from dagmap.cli import app
 from dagmap.config import TransactionConfig, load_config
+from dagmap.io.data_folder import open_folder, restore
 from dagmap.io.keys import Fleet, create_fleet, load_identity, open_fleet, open_robot
-from dagmap.model import DagmapError, KeysError, Revoked
+from dagmap.io.settings import load_settings
+from dagmap.model import DagmapError, KeysError, Revoked, StoreError
 
 WALL = np.random.default_rng(0).uniform([2, -1, -1], [2, 1, 1], (60, 3))
 
@@ -239,6 +241,26 @@ def test_folders_that_are_damaged_or_mixed_up(fleet: Fleet, tmp_path: Path) -> N
             open_fleet(missing)
     done = keys("show", tmp_path / "nowhere")
     assert "neither fleet.key nor robot.key is here" in str(done.exception)
+
+
+def test_a_robots_process_finds_its_keys(fleet: Fleet, tmp_path: Path) -> None:
+    file = tmp_path / "agent.toml"
+    head = f"fleet = 'office'\nfleet_key = '{fleet.config.fleet_key}'\n"
+    file.write_text(f"{head}keys = 'robot1'\n[store]\npath = 'data/ledger.db'\n")
+    settings, robot = load_settings(file), open_robot(tmp_path / "robot1")
+    for _ in range(2):
+        identity, store = open_folder(settings)
+        with store:
+            agent = restore(settings, identity, store, lambda data, _: data)
+        assert identity.author == robot.identity.author and agent.config.name == "robot1"
+    assert {p.name for p in (tmp_path / "data").iterdir()} == {"ledger.db", "author"}
+    (tmp_path / "data" / "ledger.db").unlink()
+    with pytest.raises(StoreError, match="key is gone.*enroll the robot anew"):
+        open_folder(settings)
+    file.write_text(f"{head}keys = 'robot9'\n[store]\npath = 'data9/ledger.db'\n")
+    with pytest.raises(KeysError, match="robot9/robot.key: cannot be read"):
+        open_folder(load_settings(file))
+    assert not (tmp_path / "data9" / "ledger.db").exists()
 
 
 # Sessions between robots

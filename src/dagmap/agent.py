@@ -285,7 +285,7 @@ def _check_certificate(identity: Identity, config: Config) -> None:
             f"Config: the certificate of {identity} is not one of the fleet {config.fleet!r} with "
             f"fleet_key = {config.fleet_key!r}; {remedy} in that fleet, or correct both keys"
         )
-    name = certificate[:-64].decode()
+    name = identity.name
     if config.name not in ("", name):
         raise ConfigError(
             f"Config: name = {config.name!r}, but the certificate names the robot {name!r}; "

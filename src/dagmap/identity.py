@@ -47,6 +47,11 @@ class Identity:
             raise ValueError("Identity.from_seed wants 32 secret bytes")
         return cls(Ed25519PrivateKey.from_private_bytes(bytes(seed)), bytes(seed), certificate)
 
+    @property
+    def name(self) -> str | None:
+        """What the certificate calls the robot, where there is one."""
+        return None if self.certificate is None else self.certificate[:-64].decode()
+
     def sign(self, message: bytes) -> bytes:
         """64 bytes of Ed25519 signature."""
         return self._key.sign(message)

@@ -229,7 +229,7 @@ def open_robot(folder: Path) -> Robot:
         until = valid_until(_read(path))
     except ValueError:
         raise KeysError(f"{path}: no X.509 certificate; make one with: dagmap keys renew") from None
-    return Robot(folder, certificate[:-64].decode(), identity, config, until)
+    return Robot(folder, identity.name or "", identity, config, until)
 
 
 def load_identity(folder: Path) -> Identity:
