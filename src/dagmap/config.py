@@ -7,12 +7,13 @@ are what the integer core uses.
 from __future__ import annotations
 
 import hashlib
+import re
 from pathlib import Path
 from typing import Literal, TypeVar
 
 import msgspec
 
-from .model import LIMIT_MM, ConfigError, CycleError, quantise_pose
+from .model import LIMIT_MM, MAX_NAME, ConfigError, CycleError, quantise_pose
 
 
 class _Checked(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -157,13 +158,18 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All parameters of one participant.
 
     fleet: name of the fleet. Its hash, with that of the fleet-wide parameters, heads every message.
-    name: what people call this robot; empty: the hexadecimal author id.
+    fleet_key: the fleet's public key, 64 hexadecimal digits (`dagmap keys` makes it). With it the
+        fleet is closed: only robots that hold a certificate of this key take part. Empty: an open
+        fleet, where any key may sign, for a first try.
+    name: what people call this robot; empty: the hexadecimal author id. In a closed fleet the
+        certificate names it.
     start_pose: (4, 4) rows of the robot's first SLAM frame in the fleet frame, metres, published as
         a link; default identity: the robots share one frame. None: unknown.
     same_origin: whether a new session of the SLAM starts in the frame of the one before.
     """
 
     fleet: str = "dagmap"
+    fleet_key: str = ""
     name: str = ""
     start_pose: tuple[tuple[float, float, float, float], ...] | None = (
         (1.0, 0.0, 0.0, 0.0),
@@ -180,8 +186,14 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     sync: SyncConfig = SyncConfig()
 
     def __post_init__(self) -> None:
-        self._require(len(self.name.encode()) <= 64, "name", "at most 64 bytes of UTF-8 are wanted")
+        fits = len(self.name.encode()) <= MAX_NAME
+        self._require(fits, "name", f"at most {MAX_NAME} bytes of UTF-8 are wanted")
         self._require(self.name.isprintable(), "name", "printable characters are wanted")
+        self._require(
+            not self.fleet_key or re.fullmatch("[0-9a-f]{64}", self.fleet_key) is not None,
+            "fleet_key",
+            "the 64 lower case hexadecimal digits are wanted that stand in the fleet's fleet.toml",
+        )
         if self.start_pose is not None:
             try:
                 quantise_pose(self.start_pose, "Config: start_pose")
@@ -190,8 +202,21 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     @property
     def fleet_id(self) -> bytes:
-        """8 bytes that name the fleet."""
-        return hashlib.blake2b(b"dagmap fleet 1\0" + self.fleet.encode(), digest_size=8).digest()
+        """8 bytes that name the fleet: a closed one by its key and its name."""
+        named = b"dagmap fleet 1\0" + self.fleet.encode()
+        if self.closed:
+            named = b"dagmap closed fleet 1\0" + self.fleet_public_key + self.fleet.encode()
+        return hashlib.blake2b(named, digest_size=8).digest()
+
+    @property
+    def closed(self) -> bool:
+        """Whether only robots with a certificate of the fleet key take part."""
+        return bool(self.fleet_key)
+
+    @property
+    def fleet_public_key(self) -> bytes:
+        """The 32 bytes of the fleet key; none in an open fleet."""
+        return bytes.fromhex(self.fleet_key)
 
     @property
     def parameters_id(self) -> bytes:

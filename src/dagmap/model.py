@@ -23,6 +23,7 @@ Bools: TypeAlias = npt.NDArray[np.bool_]
 LIMIT_MM = 1 << 29  # coordinates lie within +-LIMIT_MM before and after every pose
 QUATERNION_ONE = 1 << 30
 MAX_CYCLE = (1 << 31) - 1
+MAX_NAME = 64  # bytes of a robot's name
 FLEET_FRAME: FrameId  # defined below
 
 
@@ -48,6 +49,10 @@ class OutputError(DagmapError):
 
 class StoreError(DagmapError):
     """A ledger on disk cannot be opened, read or written."""
+
+
+class KeysError(DagmapError):
+    """A key, a certificate or the folder of a fleet cannot be made, read or trusted."""
 
 
 class NetworkError(DagmapError):
@@ -284,11 +289,13 @@ class Reason(Enum):
     PARAMETERS = "other fold parameters"
     MALFORMED = "malformed"
     PROOF_OF_WORK = "proof of work missing"
+    CERTIFICATE = "no certificate of this fleet"
     SIGNATURE = "signature does not match"
     CHAIN = "does not continue its author's chain"
     LAMPORT = "Lamport time does not follow from its references"
     STRUCTURE = "graph structure violated"
     FORK = "beyond a proven fork of its author"
+    REVOKED = "beyond the revocation of its author"
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,7 +317,11 @@ class Rejected:
 
 @dataclass(frozen=True, slots=True)
 class Waiting:
-    """A transaction is kept aside until what it refers to is known."""
+    """A transaction is kept aside until what it refers to is known.
+
+    In a closed fleet it is not even kept where nothing certified is known of its author: it comes
+    again once the author's first transaction is here.
+    """
 
     id: TransactionId
     missing: tuple[TransactionId, ...]
@@ -335,6 +346,17 @@ class Forked:
 
 
 @dataclass(frozen=True, slots=True)
+class Revoked:
+    """The fleet key has revoked an author: its first `count` transactions count, no others.
+
+    count: None where the revocation does not count any more, since the fleet key itself has forked.
+    """
+
+    author: AuthorId
+    count: int | None
+
+
+@dataclass(frozen=True, slots=True)
 class MapChanged:
     """The fold has moved: so many transactions were undone and applied."""
 
@@ -342,7 +364,7 @@ class MapChanged:
     applied: int
 
 
-Event: TypeAlias = Accepted | Rejected | Waiting | Issued | Forked | MapChanged
+Event: TypeAlias = Accepted | Rejected | Waiting | Issued | Forked | Revoked | MapChanged
 
 
 @dataclass(frozen=True, slots=True)

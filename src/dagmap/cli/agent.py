@@ -132,11 +132,12 @@ def _log_start(log: Log, agent: Agent, settings: Settings, session: int) -> None
         transactions=len(agent.ledger),
         session=session,
     )
-    log.write(
-        "warning",
-        "open mode",
-        meaning="any key may take part: no bound against liars holds; for a first try only",
-    )
+    if not agent.config.closed:
+        log.write(
+            "warning",
+            "open mode",
+            meaning="any key may take part: no bound against liars holds; for a first try only",
+        )
 
 
 @contextmanager
