@@ -153,7 +153,8 @@ def quantise_points(points: npt.ArrayLike, where: str = "points") -> Int32s:
         return np.zeros((0, 3), np.int32)
     if metres.ndim != 2 or metres.shape[1] != 3:
         raise CycleError(f"{where}: the shape is {metres.shape}; (N, 3) is wanted")
-    millimetres = np.floor(metres * 1000.0 + 0.5)
+    with np.errstate(over="ignore"):  # to infinity, which is refused
+        millimetres = np.floor(metres * 1000.0 + 0.5)
     bad = np.asarray(~(np.abs(millimetres) <= LIMIT_MM).all(axis=1))  # catches NaN too
     if bad.any():
         row = int(np.flatnonzero(bad)[0])

@@ -90,10 +90,17 @@ def _frames(path: Path) -> list[_Frame]:
         )
     for frame in frames:
         for picture in (frame.color, frame.depth):
-            if not picture.is_file():
+            if not _is_file(picture):
                 by = f", named in {frame.line}" if frame.line else ""
                 raise RecordingError(f"{picture}: missing{by}; copy it or drop its frame")
     return frames
+
+
+def _is_file(picture: Path) -> bool:
+    try:
+        return picture.is_file()
+    except OSError:  # a name too long, a folder that may not be entered
+        return False
 
 
 def _associated(path: Path, file: Path) -> list[_Frame]:
