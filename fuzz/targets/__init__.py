@@ -31,6 +31,7 @@ class Target:
     seeds: Callable[[], Iterable[bytes]]
     parsers: dict[str, tuple[str, ...]]
     max_len: int = 4096
+    generated: tuple[bytes, ...] = ()  # inputs of the corpus that are too large to be kept as files
     pure: bool = False  # kernels as plain Python, so that they are instrumented too
 
 
@@ -48,5 +49,6 @@ def load(name: str) -> Target:
 
 
 def corpus(name: str) -> list[bytes]:
-    """The kept inputs of a target, in order of their names."""
-    return [path.read_bytes() for path in sorted((CORPUS / name).iterdir())]
+    """The kept inputs of a target, in order of their names, and the generated ones."""
+    files = sorted((CORPUS / name).iterdir())
+    return [*(path.read_bytes() for path in files), *load(name).generated]

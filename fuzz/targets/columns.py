@@ -64,6 +64,7 @@ def seeds() -> Iterable[bytes]:
         slots = (2, 2, 3, 8, 1, 0)[seed % 6]
         base = (0, 40, MAX_NUMBER)[seed % 3]
         yield written(bundle(Random(seed), 3 + seed % 10, 1 + seed % 3, base, max(slots, 2)), slots)
+    yield bytes((9, 0, 1, 1, 1, 0))  # nine parents
 
 
 PARSERS = {"dagmap.kernels.codec": ("encode_features",), "dagmap.kernels.rangecoder": ()}

@@ -9,7 +9,7 @@ from random import Random
 import msgspec
 from grammar import Flip
 from targets import Target
-from targets._files import workplace
+from targets._files import workplace, write
 from targets._wire import ROBOTS
 
 from dagmap import Agent
@@ -29,7 +29,7 @@ _GROUPS = {
 
 
 def run(data: bytes) -> bool:
-    _FILE.write_bytes(data)
+    write(_FILE, data)
     try:
         config = load_config(_FILE)
     except DagmapError as error:

@@ -36,4 +36,4 @@ def seeds() -> Iterable[bytes]:
 
 
 ENCODERS = ("seal", "_work", "Transaction.*")
-TARGET = Target(run, mutate, seeds, {"dagmap.transaction": ENCODERS}, max_len=57_000)
+TARGET = Target(run, mutate, seeds, {"dagmap.transaction": ENCODERS}, max_len=57_000, generated=(bytes(MAX_SIZE + 1),))

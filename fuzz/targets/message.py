@@ -11,7 +11,7 @@ from targets import Target
 from targets._wire import CONFIG, ROBOTS, change, message
 
 from dagmap import messages
-from dagmap.messages import Head, Heads, Transactions, Want
+from dagmap.messages import MAX_MESSAGE, Head, Heads, Transactions, Want
 from dagmap.wire import Refusal
 
 _MESSAGE = message(rest)
@@ -28,7 +28,7 @@ def run(data: bytes) -> bool:
 
 def mutate(data: bytes, rng: Random, flip: Flip) -> bytes:
     """Mostly bytes between the head and the checksum, which is made right again: that is fast."""
-    if rng.random() < 0.05:
+    if rng.random() < 0.03:
         return change(data, _MESSAGE, rng, flip)
     if rng.random() < 0.03:
         return flip(data)
@@ -60,4 +60,5 @@ TARGET = Target(
     seeds,
     {"dagmap.messages": ENCODERS, "dagmap.wire": ("number", "signed")},
     max_len=61_000,
+    generated=(bytes(MAX_MESSAGE + 1),),
 )

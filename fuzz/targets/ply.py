@@ -8,7 +8,7 @@ from random import Random
 import numpy as np
 from grammar import Flip
 from targets import Target
-from targets._files import workplace
+from targets._files import workplace, write
 
 from dagmap.io.export import _CODES, PlyMap, read_ply, write_ply
 from dagmap.model import DagmapError
@@ -19,7 +19,7 @@ _WORDS += tuple(_CODES)
 
 
 def run(data: bytes) -> bool:
-    _FILE.write_bytes(data)
+    write(_FILE, data)
     try:
         found = read_ply(_FILE)
     except DagmapError as error:

@@ -9,7 +9,7 @@ from random import Random
 
 from grammar import Flip
 from targets import Target
-from targets._files import workplace
+from targets._files import workplace, write
 from targets._wire import CONFIG, ROBOTS
 
 from dagmap.io.store import Store
@@ -41,12 +41,15 @@ _CHANGES = (
 def run(data: bytes) -> bool:
     for name in (_FILE, _FILE.with_name("robot.db-wal"), _FILE.with_name("robot.db-shm")):
         name.unlink(missing_ok=True)
-    _FILE.write_bytes(data)
+    write(_FILE, data)
     try:
+        if not data:
+            Store.open(_FILE)  # what is not there is not made without a fleet
         with Store.open(_FILE, CONFIG.fleet_id, ROBOTS[0].author) as store:
             kept = list(store)
             assert len(store) == len(kept) and all(isinstance(item, bytes) for item in kept)
             store.append(id_of(b"next"), b"next")
+        Store.open(_FILE).close()
     except DagmapError as error:
         assert str(error).startswith(str(_FILE)) and "\n" not in str(error)
         return False

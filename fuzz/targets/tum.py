@@ -117,6 +117,11 @@ def seeds() -> Iterable[bytes]:
     yield pack([*start, truth, named, (b"rgb/1.jpg", jpg), pictures[1]])
     yield pack([(b"rgb/", b""), (b"depth/", b"")])
     yield pack([*start, (b"rgb/", b""), (b"depth/", b"")])
+    yield pack([*start, *pictures])  # no poses
+    yield pack([*start, *pictures, (b"groundtruth.txt/", b"")])
+    yield pack([*start, *pictures, truth, (b"associations.txt", b"1 rgb/1.0.png 1 " + b"x" * 300)])
+    damaged = [(b"rgb/1.0.png", png[0]), (b"depth/1.01.png", jpg)]
+    yield pack([*start, truth, *damaged])
 
 
 PARSERS = {

@@ -179,8 +179,11 @@ def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any], Literal["C
 def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> _Array:
     with archive.open(info) as file:
         shape, dtype, order = _header(file)
-        data = bytearray(file.read(math.prod(shape) * dtype.itemsize))
+        size = math.prod(shape) * dtype.itemsize
+        data = bytearray(file.read(size))
         file.read(1)  # at the end the checksum is compared
+    if len(data) < size:
+        raise ValueError(f"{info.filename[:60]!r} ends early")
     return np.ndarray(shape, dtype, data, order=order)
 
 
@@ -190,7 +193,7 @@ def _check_names(path: Path, names: set[str]) -> None:
         raise RecordingError(f"{path}: no array {missing[0]}; a cycle stream needs {_NEEDED}")
     unknown = sorted(names - set(_LAYOUT))
     if unknown:
-        raise RecordingError(f"{path}: unknown array {unknown[0]}; known are {tuple(_LAYOUT)}")
+        raise RecordingError(f"{path}: unknown array {unknown[0][:60]!r}; known are {tuple(_LAYOUT)}")
     for group in _TOGETHER:
         given = [name for name in group if name in names]
         if given and len(given) != len(group):

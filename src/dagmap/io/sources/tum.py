@@ -184,7 +184,8 @@ def _trajectory(file: Path) -> tuple[Floats, Floats]:
 def _pose(values: list[float], line: str) -> Floats:
     """(4, 4) from translation and quaternion."""
     quaternion = np.array(values[3:])
-    length = float(np.linalg.norm(quaternion))
+    with np.errstate(over="ignore"):  # to infinity, which is refused
+        length = float(np.linalg.norm(quaternion))
     if not 0.9 < length < 1.1:
         raise RecordingError(f"{line}: a quaternion of length {length:.3g}; 1 is wanted")
     x, y, z, w = quaternion / length
