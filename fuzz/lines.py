@@ -88,9 +88,10 @@ def reached(names: list[str]) -> tuple[int, list[str]]:
     for target in loaded.values():
         parsers |= target.parsers
     files = {name: Path(str(import_module(name).__file__)) for name in parsers}
-    with Tracer({str(path) for path in files.values()}) as tracer:
-        for name, target in loaded.items():
-            for data in targets.corpus(name):
+    tracer = Tracer({str(path) for path in files.values()})
+    for name, target in loaded.items():
+        for data in targets.corpus(name):
+            with tracer:  # anew each time: Python drops a tracer in which its stack ran out
                 target.run(data)
     total, missed = 0, []
     for name, path in files.items():

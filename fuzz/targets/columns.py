@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from random import Random
+from unittest.mock import patch
 
 import numpy as np
 from grammar import Flip, counted, number, record, rest
@@ -14,6 +15,7 @@ from targets import Target
 from targets._wire import bundle, change
 
 from dagmap import wire
+from dagmap.kernels import rangecoder
 from dagmap.kernels.codec import decode_features, encode_features
 from dagmap.payload import MAX_NUMBER, Bundle
 from dagmap.wire import Reader, Refusal
@@ -65,6 +67,26 @@ def seeds() -> Iterable[bytes]:
         base = (0, 40, MAX_NUMBER)[seed % 3]
         yield written(bundle(Random(seed), 3 + seed % 10, 1 + seed % 3, base, max(slots, 2)), slots)
     yield bytes((9, 0, 1, 1, 1, 0))  # nine parents
+    yield _remainder()
+    few = bundle(Random(0), 2, 1)
+    few.parents[:] = [[5, -1], [few.base, 5]]
+    with patch.object(rangecoder, "_shared", lambda *_: -1):  # has no effect on compiled kernels
+        yield written(few, 2)
+
+
+def _remainder() -> bytes:
+    """A code in the remainder of a division, where no encoder goes: the decoder must say so."""
+    state, models = np.zeros(rangecoder.STATE, np.int64), np.full(rangecoder.MODELS, rangecoder.FRESH, np.int32)
+    data = np.zeros(32, np.uint8)
+    rangecoder._begin(state, data)
+    zeros = [(axis, 0) for _ in range(4) for axis in (2, 3, 4)]  # four points at zero
+    for axis, length in [*zeros, (2, 14)]:  # then the next one's x
+        state[rangecoder._LENGTH] = 0
+        rangecoder._length(state, models, data, axis, length)
+    state[0] += state[1] - 1  # low to the end of its interval
+    rangecoder._end(state, data)
+    head = (0, 0, 5, 1, 5, 0)  # no parents, base 0, five features in one segment without colour
+    return bytes(head) + data[: state[rangecoder.AT]].tobytes()
 
 
 PARSERS = {"dagmap.kernels.codec": ("encode_features",), "dagmap.kernels.rangecoder": ()}

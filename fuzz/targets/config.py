@@ -64,7 +64,6 @@ def mutate(data: bytes, rng: Random, flip: Flip) -> bytes:
 
 
 def seeds() -> Iterable[bytes]:
-    yield b""
     yield _written(Config(name="robot"))
     yield b"[graph]\nn_p = 3\nn_c = 2\n"
     yield b"[issuance]\nfeatures_per_second = 100.0\n"
@@ -86,4 +85,4 @@ def _written(config: Config) -> bytes:
 
 
 PARSERS = {"dagmap.config": ()}
-TARGET = Target(run, mutate, seeds, PARSERS, max_len=16_384)
+TARGET = Target(run, mutate, seeds, PARSERS, max_len=16_384, generated=(b"", b"name = " + b"9" * 5000))

@@ -61,4 +61,4 @@ def seeds() -> Iterable[bytes]:
 
 
 ENCODERS = ("write_ply", "write_graph_npz", "prepare_out", "atomic_write", "_*result*", "_output_error", "MapLike.*")
-TARGET = Target(run, mutate, seeds, {"dagmap.io.export": ENCODERS}, max_len=4096)
+TARGET = Target(run, mutate, seeds, {"dagmap.io.export": ENCODERS}, max_len=4096, generated=(b"",))

@@ -71,7 +71,6 @@ def mutate(data: bytes, rng: Random, flip: Flip) -> bytes:
 
 
 def seeds() -> Iterable[bytes]:
-    yield b""
     for author, count in ((None, 0), (ROBOTS[0].author, 3), (ROBOTS[1].author, 1)):
         _FILE.unlink(missing_ok=True)
         with closing(sqlite3.connect(_FILE)) as database:
@@ -84,4 +83,4 @@ def seeds() -> Iterable[bytes]:
 
 
 ENCODERS = ("Store.append*", "Store.__bool__", "Store._create", "Store.close", "Store._in_use")
-TARGET = Target(run, mutate, seeds, {"dagmap.io.store": ENCODERS}, max_len=16_384)
+TARGET = Target(run, mutate, seeds, {"dagmap.io.store": ENCODERS}, max_len=16_384, generated=(b"",))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import zlib
 from collections.abc import Iterable
 from pathlib import Path
 from random import Random
@@ -122,6 +123,11 @@ def seeds() -> Iterable[bytes]:
     yield pack([*start, *pictures, truth, (b"associations.txt", b"1 rgb/1.0.png 1 " + b"x" * 300)])
     damaged = [(b"rgb/1.0.png", png[0]), (b"depth/1.01.png", jpg)]
     yield pack([*start, truth, *damaged])
+    size = (100_000).to_bytes(4, "big")
+    chunks = (b"IHDR" + 2 * size + bytes((8, 0, 0, 0, 0)), b"IDAT", b"IEND")
+    parts = (len(c[4:]).to_bytes(4, "big") + c + zlib.crc32(c).to_bytes(4, "big") for c in chunks)
+    huge = b"\x89PNG\r\n\x1a\n" + b"".join(parts)  # more pixels than OpenCV takes
+    yield pack([*start, truth, (b"rgb/1.0.png", huge), pictures[1]])
 
 
 PARSERS = {

@@ -118,7 +118,7 @@ def _load(path: Path) -> _Arrays:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         for name, info in members.items():
             if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise ValueError(f"{name} is packed by method {info.compress_type}")
+                raise ValueError(f"{name[:60]!r} is packed by method {info.compress_type}")
         _check_version(path, archive, members)
         _check_names(path, set(members))
         shapes: dict[str, tuple[int, ...]] = {}
