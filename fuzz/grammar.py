@@ -168,7 +168,9 @@ def labelled(root: Branch, label: str) -> list[Branch]:
     return [node for node in nodes if isinstance(node, Branch) and node.label == label]
 
 
-def mutate(root: Branch, rng: Random, flip: Flip, special: dict[str, Special] | None = None) -> None:
+def mutate(
+    root: Branch, rng: Random, flip: Flip, special: dict[str, Special] | None = None
+) -> None:
     """Change one to three nodes in place; `special` changes records by their label."""
     for label, change in (special or {}).items():
         for node in labelled(root, label):

@@ -1,6 +1,7 @@
 """Fuzz one parser with atheris (libFuzzer for Python).
 
     python fuzz/run.py TARGET [--runs N | --seconds S] [--seed N]
+    python fuzz/run.py all [--runs N]     N in all, shared by speed (default 1,000,000)
     python fuzz/run.py TARGET --merge     move what found new ground into fuzz/corpus, minimised
     python fuzz/run.py TARGET --show FILE run one input, as it was found
 
@@ -26,8 +27,16 @@ from random import Random
 ROOT = Path(__file__).resolve().parents[1]
 OUT = ROOT / "out" / "fuzz"
 PURE = "NUMBA_DISABLE_JIT"
-LIMITS = ("-timeout=10", "-rss_limit_mb=2048", "-print_final_stats=1", "-reload=0", "-mutate_depth=1")
+LIMITS = (
+    "-timeout=10",
+    "-rss_limit_mb=2048",
+    "-print_final_stats=1",
+    "-reload=0",
+    "-mutate_depth=1",
+)
 
+SHARES = {"message": 500, "ply": 160, "records": 130, "config": 110, "envelope": 40, "npz": 20}
+SHARES |= {"store": 12, "tum": 16, "columns": 8, "agent": 4}
 _PURE = ("kernels.codec", "kernels.rangecoder")
 _COMPILED = ("wire", "messages", "payload", "transaction", "config", "ledger", "sync", "agent")
 _COMPILED += ("io.sources._source", "io.sources._rgbd", "io.sources.npz", "io.sources.tum")
@@ -44,14 +53,16 @@ def main() -> None:
         print(_target(options.target).run(options.show.read_bytes()))
     elif options.merge:
         _merge(options.target)
+    elif options.target == "all":
+        _run_all(options)
     else:
-        _run(options)
+        sys.exit(_run(options))
 
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("target")
-    parser.add_argument("--runs", type=int, default=100_000)
+    parser.add_argument("--runs", type=int, default=1_000_000)
     parser.add_argument("--seconds", type=int, default=0)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--merge", action="store_true")
@@ -66,7 +77,16 @@ def _target(name: str):  # type: ignore[no-untyped-def]
     return targets.load(name)
 
 
-def _run(options: argparse.Namespace) -> None:
+def _run_all(options: argparse.Namespace) -> None:
+    """Every target, the slow ones less often."""
+    runs, codes = options.runs, []
+    for options.target, share in SHARES.items():
+        options.runs = max(1, runs * share // sum(SHARES.values()))
+        codes.append(_run(options))
+    sys.exit(any(codes))
+
+
+def _run(options: argparse.Namespace) -> int:
     """The fuzzer in a process of its own, since libFuzzer ends the one that it runs in."""
     import targets
 
@@ -91,7 +111,7 @@ def _run(options: argparse.Namespace) -> None:
     with (OUT / "runs.jsonl").open("a") as log:
         log.write(json.dumps(figures) + "\n")
     print(json.dumps(figures))
-    sys.exit(code)
+    return code
 
 
 def _child(name: str, arguments: list[str], pure: bool) -> tuple[int, str]:
@@ -113,7 +133,9 @@ def _fuzz(name: str, arguments: list[str]) -> None:
     import atheris
 
     # Edges only: to trace every comparison too costs more than half of the speed.
-    with atheris.import_hook.HookManager({"dagmap"}, set(_left_alone()), True, trace_dataflow=False):
+    with atheris.import_hook.HookManager(
+        {"dagmap"}, set(_left_alone()), True, trace_dataflow=False
+    ):
         for module in _parsers():
             import_module(f"dagmap.{module}")
     target = _target(name)
@@ -121,7 +143,9 @@ def _fuzz(name: str, arguments: list[str]) -> None:
 
     def mutate(data: bytes, max_size: int, seed: int) -> bytes:
         rng = Random(seed)
-        out = target.mutate(data, rng, lambda part: atheris.Mutate(part, len(part) + 64) if part else b"")
+        out = target.mutate(
+            data, rng, lambda part: atheris.Mutate(part, len(part) + 64) if part else b""
+        )
         return out if len(out) <= max_size else data[:max_size]
 
     again = f"{sys.executable} {__file__} {name} --child"  # a merge starts itself anew, by a shell
@@ -150,7 +174,9 @@ def _merge(name: str) -> None:
     merged.mkdir(parents=True, exist_ok=True)
     for old in merged.iterdir():
         old.unlink()
-    code, _ = _child(name, ["-merge=1", *LIMITS, str(merged), str(kept), str(OUT / name)], target.pure)
+    code, _ = _child(
+        name, ["-merge=1", *LIMITS, str(merged), str(kept), str(OUT / name)], target.pure
+    )
     if code == 0 and any(merged.iterdir()):
         for old in kept.iterdir():
             old.unlink()

@@ -1,6 +1,6 @@
 """Write the seeds of every target into its corpus, each named by its SHA-1 as libFuzzer does.
 
-    python fuzz/seeds.py [TARGET ...]
+python fuzz/seeds.py [TARGET ...]
 """
 
 from __future__ import annotations

@@ -21,16 +21,23 @@ from random import Random
 
 import numpy as np
 import pytest
+
 import targets
+from dagmap.payload import Kind, encode_payload
+from dagmap.wire import Reader
 from grammar import flipper, rest, tree
 from targets import _wire, tum
 
-from dagmap.payload import Kind, encode_payload
-from dagmap.wire import Reader
-
 ROOT = Path(__file__).parents[1]
 NAMES = targets.names()
-MUTATIONS = {"agent": 150, "columns": 1500, "envelope": 1000, "npz": 1500, "store": 300, "tum": 200}  # of slow targets
+MUTATIONS = {
+    "agent": 150,
+    "columns": 1500,
+    "envelope": 1000,
+    "npz": 1500,
+    "store": 300,
+    "tum": 200,
+}  # of slow targets
 SECONDS, BYTES = 30, 2 << 30  # for one input, far more than any needs
 
 
@@ -117,7 +124,9 @@ def damaged(method: int) -> bytes:
 
 def far_pose() -> bytes:
     out = io.BytesIO()
-    np.savez(out, stamp=[0.0], pose=np.full((1, 4, 4), 1e200), points=np.zeros((0, 3)), offsets=[0, 0])
+    np.savez(
+        out, stamp=[0.0], pose=np.full((1, 4, 4), 1e200), points=np.zeros((0, 3)), offsets=[0, 0]
+    )
     return out.getvalue()
 
 
@@ -145,10 +154,15 @@ FOUND: dict[str, tuple[str, Callable[[], bytes]]] = {
     "an unfinished header": ("npz", lambda: stream(points=b"{'descr': '<f4', (")),
     "a header with a list as key": ("npz", lambda: stream(points=b"{[]: 1}")),
     "a header of Python 2": ("npz", lambda: stream(points=lambda old: old.replace(b"3)", b"3L)"))),
-    "a header of another version": ("npz", lambda: stream(points=lambda old: b"{'descr': ('<f4',)}")),
+    "a header of another version": (
+        "npz",
+        lambda: stream(points=lambda old: b"{'descr': ('<f4',)}"),
+    ),
     "a version that ends early": (
         "npz",
-        lambda: packed({"version.npy": header("{'descr':'<i8','fortran_order':False,'shape':()}")}, 0),
+        lambda: packed(
+            {"version.npy": header("{'descr':'<i8','fortran_order':False,'shape':()}")}, 0
+        ),
     ),
     "a name of two lines": ("npz", lambda: packed({"two\nlines": b""}, zipfile.ZIP_STORED)),
     "a damaged LZMA member": ("npz", lambda: damaged(zipfile.ZIP_LZMA)),
@@ -179,6 +193,12 @@ def test_what_the_fuzzing_found_is_refused(what: str) -> None:
     name, make = FOUND[what]
     with bounded():
         assert run(targets.load(name), make()) is False
+
+
+@pytest.mark.parametrize("path", sorted(targets.FOUND.glob("*/*")), ids=lambda path: path.name)
+def test_files_that_the_fuzzing_found_are_refused(path: Path) -> None:
+    with bounded():
+        assert run(targets.load(path.parent.name), path.read_bytes()) is False
 
 
 @pytest.mark.parametrize("what", LEDGERS)

@@ -16,6 +16,7 @@ from random import Random
 from grammar import Flip
 
 CORPUS = Path(__file__).parents[1] / "corpus"
+FOUND = Path(__file__).parents[1] / "found"  # what once was no typed refusal, by target
 
 
 @dataclass(frozen=True)

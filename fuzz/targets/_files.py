@@ -20,6 +20,10 @@ def write(path: Path, data: bytes) -> None:
 
 def workplace() -> Path:
     """A new folder, gone when the process ends; in memory where there is such a place."""
-    path = Path(tempfile.mkdtemp(prefix="dagmap-fuzz-", dir=_MEMORY if os.access(_MEMORY, os.W_OK) else None))
+    path = Path(
+        tempfile.mkdtemp(
+            prefix="dagmap-fuzz-", dir=_MEMORY if os.access(_MEMORY, os.W_OK) else None
+        )
+    )
     atexit.register(shutil.rmtree, path, ignore_errors=True)
     return path

@@ -10,6 +10,14 @@ import zlib
 from random import Random
 
 import numpy as np
+
+from dagmap import messages, payload, transaction
+from dagmap.config import Config, TransactionConfig
+from dagmap.identity import Identity
+from dagmap.model import FLEET_FRAME, LIMIT_MM, FrameId, quantise_pose
+from dagmap.payload import Anchor, Bundle, Kind, Link, Payload, Sighting
+from dagmap.transaction import id_of
+from dagmap.wire import Reader, Refusal
 from grammar import (
     Branch,
     Flip,
@@ -30,14 +38,6 @@ from grammar import (
     tree,
     when,
 )
-
-from dagmap import messages, payload, transaction
-from dagmap.config import Config, TransactionConfig
-from dagmap.identity import Identity
-from dagmap.model import FLEET_FRAME, LIMIT_MM, FrameId, quantise_pose
-from dagmap.payload import Anchor, Bundle, Kind, Link, Payload, Sighting
-from dagmap.transaction import id_of
-from dagmap.wire import Reader, Refusal
 
 CONFIG = Config(transaction=TransactionConfig(proof_of_work_bits=1))
 ROBOTS = [Identity.from_seed(bytes([i]) * 32) for i in range(3)]
@@ -70,7 +70,11 @@ TRANSACTION = record(
 
 
 def _cut_follows(before: list[Node]) -> bool:
-    return isinstance(before[1], Leaf) and isinstance(before[1].value, int) and bool(before[1].value & 1)
+    return (
+        isinstance(before[1], Leaf)
+        and isinstance(before[1].value, int)
+        and bool(before[1].value & 1)
+    )
 
 
 def message(content: Grammar) -> Grammar:
@@ -100,7 +104,13 @@ def payloads() -> list[Payload]:
     """A sample of every kind of record, the smallest and one with more in it."""
     none, color = np.full((1, 2), -1, np.int64), np.zeros((1, 3), np.uint8)
     one = Bundle(
-        0, np.zeros((1, 3), np.int32), none, color, np.array([0, 1]), np.array([0]), np.zeros(1, np.uint8)
+        0,
+        np.zeros((1, 3), np.int32),
+        none,
+        color,
+        np.array([0, 1]),
+        np.array([0]),
+        np.zeros(1, np.uint8),
     )
     anchors = (Anchor(0, 0, 0, _POSE), Anchor(3, 1, -1_000_000, _POSE))
     frame = FrameId(ROBOTS[0].author, 1)
@@ -140,7 +150,7 @@ def bundle(rng: Random, count: int, segments: int, base: int = 40, n_p: int = 2)
 
 
 def change_bundle(body: bytes, rng: Random) -> bytes:
-    """A bundle record with other columns, encoded anew: the coder's own bytes fail at any change."""
+    """A bundle record with other columns, encoded anew: any change of the code itself fails."""
     try:
         old = payload._decode_bundle(Reader(body), CONFIG.graph.n_p)
     except Refusal:

@@ -10,9 +10,6 @@ from collections.abc import Iterable, Iterator
 from random import Random
 
 import numpy as np
-from grammar import Flip, many, sized
-from targets import Target
-from targets._wire import CONFIG, ROBOTS, TRANSACTION, change, message, payloads
 
 from dagmap import Agent, Cycle, messages, wire
 from dagmap.ledger import Ledger
@@ -20,6 +17,9 @@ from dagmap.messages import Head, Heads, Transactions, Want
 from dagmap.payload import Payload
 from dagmap.transaction import id_of, parse, seal
 from dagmap.wire import Reader, Refusal
+from grammar import Flip, many, sized
+from targets import Target
+from targets._wire import CONFIG, ROBOTS, TRANSACTION, change, message, payloads
 
 _TALK = many(sized(message(TRANSACTION)))
 _MOST = 12  # messages of one input
@@ -83,7 +83,11 @@ def seeds() -> Iterator[bytes]:
     tip = id_of(start)[:8]
     yield _talk(
         Transactions((start,)),
-        Heads(3, ((ROBOTS[2].author, 1, 5),), (Head(first.author, 4, tip), Head(second.author, 1, tip, 1))),
+        Heads(
+            3,
+            ((ROBOTS[2].author, 1, 5),),
+            (Head(first.author, 4, tip), Head(second.author, 1, tip, 1)),
+        ),
         Transactions((), more=True),
         Want(((first.author, 0, 9),), (id_of(start), bytes(32)), (second.author,)),
     )
@@ -92,7 +96,7 @@ def seeds() -> Iterator[bytes]:
 def _walk() -> Iterable[bytes]:
     """What a robot says that sees, sees again, withdraws and moves."""
     agent, rng = Agent(ROBOTS[0], CONFIG), np.random.default_rng(5)
-    points = rng.normal(0, 0.05, (14, 3)) + (1, 0, 0)
+    points = rng.normal(0, 0.05, (14, 3)) + np.array([1.0, 0, 0])
     pose = np.eye(4)
     for i in range(3):
         agent.observe(

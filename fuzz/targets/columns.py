@@ -10,15 +10,15 @@ from random import Random
 from unittest.mock import patch
 
 import numpy as np
-from grammar import Flip, counted, number, record, rest
-from targets import Target
-from targets._wire import bundle, change
 
 from dagmap import wire
 from dagmap.kernels import rangecoder
 from dagmap.kernels.codec import decode_features, encode_features
 from dagmap.payload import MAX_NUMBER, Bundle
 from dagmap.wire import Reader, Refusal
+from grammar import Flip, counted, number, record, rest
+from targets import Target
+from targets._wire import bundle, change
 
 _MOST = 16  # features and segments: in plain Python a feature takes a millisecond
 _COLUMNS = record(number, number, number, counted(record(number, number)), rest)
@@ -57,7 +57,13 @@ def written(columns: Bundle, slots: int) -> bytes:
     code = encode_features(
         columns.position, parents, columns.base, columns.starts, columns.color, columns.colored
     )
-    head = [slots, columns.base, len(columns.position), len(rows), *(v for row in rows for v in row)]
+    head = [
+        slots,
+        columns.base,
+        len(columns.position),
+        len(rows),
+        *(v for row in rows for v in row),
+    ]
     return b"".join(map(wire.number, head)) + code.tobytes()
 
 
@@ -76,7 +82,10 @@ def seeds() -> Iterable[bytes]:
 
 def _remainder() -> bytes:
     """A code in the remainder of a division, where no encoder goes: the decoder must say so."""
-    state, models = np.zeros(rangecoder.STATE, np.int64), np.full(rangecoder.MODELS, rangecoder.FRESH, np.int32)
+    state, models = (
+        np.zeros(rangecoder.STATE, np.int64),
+        np.full(rangecoder.MODELS, rangecoder.FRESH, np.int32),
+    )
     data = np.zeros(32, np.uint8)
     rangecoder._begin(state, data)
     zeros = [(axis, 0) for _ in range(4) for axis in (2, 3, 4)]  # four points at zero

@@ -7,21 +7,45 @@ from collections.abc import Iterable
 from random import Random
 
 import msgspec
+
+from dagmap import Agent
+from dagmap.config import Config, load_config
+from dagmap.model import DagmapError
 from grammar import Flip
 from targets import Target
 from targets._files import workplace, write
 from targets._wire import ROBOTS
 
-from dagmap import Agent
-from dagmap.config import Config, load_config
-from dagmap.model import DagmapError
-
 _FILE = workplace() / "robot.toml"
 _VALUES = (
-    "0", "1", "-1", "8", "9", "255", "1e300", "-0.0", "nan", "inf", "true", '""', '"x"', "[]", "{}",
-    "0x" + "f" * 64, "0x" + "f" * 5000, "9" * 400, "9" * 5000, "1979-05-27", '"\\u0000"', '"\\U0001F600"',
-    "[" * 60 + "]" * 60, "[" * 3000, "[[1.0,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]", "'paper'", "4611686018427387905",
-)  # fmt: skip
+    "0",
+    "1",
+    "-1",
+    "8",
+    "9",
+    "255",
+    "1e300",
+    "-0.0",
+    "nan",
+    "inf",
+    "true",
+    '""',
+    '"x"',
+    "[]",
+    "{}",
+    "0x" + "f" * 64,
+    "0x" + "f" * 5000,
+    "9" * 400,
+    "9" * 5000,
+    "1979-05-27",
+    '"\\u0000"',
+    '"\\U0001F600"',
+    "[" * 60 + "]" * 60,
+    "[" * 3000,
+    "[[1.0,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]",
+    "'paper'",
+    "4611686018427387905",
+)
 _GROUPS = {
     name: list(msgspec.to_builtins(value) if isinstance(value, msgspec.Struct) else ())
     for name, value in ((n, getattr(Config(), n)) for n in Config.__struct_fields__)
@@ -70,7 +94,7 @@ def seeds() -> Iterable[bytes]:
     yield b"start_pose = [[1,0,0,0],[0,1,0,0],[0,0,2,0],[0,0,0,1]]\n"
     yield b"no key\n"
     yield b"\xff"
-    yield b'fleet = 5\n'
+    yield b"fleet = 5\n"
 
 
 def _written(config: Config) -> bytes:
@@ -85,4 +109,6 @@ def _written(config: Config) -> bytes:
 
 
 PARSERS = {"dagmap.config": ()}
-TARGET = Target(run, mutate, seeds, PARSERS, max_len=16_384, generated=(b"", b"name = " + b"9" * 5000))
+TARGET = Target(
+    run, mutate, seeds, PARSERS, max_len=16_384, generated=(b"", b"name = " + b"9" * 5000)
+)

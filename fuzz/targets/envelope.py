@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from random import Random
 
-from grammar import Flip
-from targets import Target
-from targets._wire import CONFIG, ROBOTS, TRANSACTION, change, payloads
-
 from dagmap.payload import Payload
 from dagmap.transaction import MAX_SIZE, id_of, parse, seal
 from dagmap.wire import Refusal
+from grammar import Flip
+from targets import Target
+from targets._wire import CONFIG, ROBOTS, TRANSACTION, change, payloads
 
 
 def run(data: bytes) -> bool:
@@ -36,4 +35,11 @@ def seeds() -> Iterable[bytes]:
 
 
 ENCODERS = ("seal", "_work", "Transaction.*")
-TARGET = Target(run, mutate, seeds, {"dagmap.transaction": ENCODERS}, max_len=57_000, generated=(bytes(MAX_SIZE + 1),))
+TARGET = Target(
+    run,
+    mutate,
+    seeds,
+    {"dagmap.transaction": ENCODERS},
+    max_len=57_000,
+    generated=(bytes(MAX_SIZE + 1),),
+)

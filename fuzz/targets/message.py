@@ -6,13 +6,12 @@ import zlib
 from collections.abc import Iterable
 from random import Random
 
-from grammar import Flip, rest
-from targets import Target
-from targets._wire import CONFIG, ROBOTS, change, message
-
 from dagmap import messages
 from dagmap.messages import MAX_MESSAGE, Head, Heads, Transactions, Want
 from dagmap.wire import Refusal
+from grammar import Flip, rest
+from targets import Target
+from targets._wire import CONFIG, ROBOTS, change, message
 
 _MESSAGE = message(rest)
 

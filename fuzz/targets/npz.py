@@ -8,21 +8,45 @@ from collections.abc import Iterable
 from random import Random
 
 import numpy as np
-from grammar import Flip
-from targets import Target
-from targets._files import workplace
 
 from dagmap.io.sources import Options, npz, save_cycles
 from dagmap.model import Cycle, DagmapError
+from grammar import Flip
+from targets import Target
+from targets._files import workplace
 
 _FILE = workplace() / "robot.npz"
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
 _DATE = (1980, 1, 1, 0, 0, 0)
 _HEADERS = (
-    b"'<f8'", b"'<f4'", b"'>f8'", b"'|u1'", b"'<u8'", b"'|O'", b"'<U9'", b"'<f2'", b"'<f16'", b"'<i8'", b"True", b"()",
-    b"(1,)", b"(0, 3)", b"(-1,)", b"(3, 3)", b"(9223372036854775808,)", b"(1, 4, 4)", b"[('a', '<f8')]", b"{[]: 1}",
-    b"('<f8',)", b"('<f8', (2, 2))", b"'(", b"(" * 300, b"\\", b"'\\d'", b"1L",
-)  # fmt: skip
+    b"'<f8'",
+    b"'<f4'",
+    b"'>f8'",
+    b"'|u1'",
+    b"'<u8'",
+    b"'|O'",
+    b"'<U9'",
+    b"'<f2'",
+    b"'<f16'",
+    b"'<i8'",
+    b"True",
+    b"()",
+    b"(1,)",
+    b"(0, 3)",
+    b"(-1,)",
+    b"(3, 3)",
+    b"(9223372036854775808,)",
+    b"(1, 4, 4)",
+    b"[('a', '<f8')]",
+    b"{[]: 1}",
+    b"('<f8',)",
+    b"('<f8', (2, 2))",
+    b"'(",
+    b"(" * 300,
+    b"\\",
+    b"'\\d'",
+    b"1L",
+)
 
 
 def run(data: bytes) -> bool:

@@ -6,15 +6,29 @@ from collections.abc import Iterable
 from random import Random
 
 import numpy as np
+
+from dagmap.io.export import _CODES, PlyMap, read_ply, write_ply
+from dagmap.model import DagmapError
 from grammar import Flip
 from targets import Target
 from targets._files import workplace, write
 
-from dagmap.io.export import _CODES, PlyMap, read_ply, write_ply
-from dagmap.model import DagmapError
-
 _FILE = workplace() / "map.ply"
-_WORDS = (b"element", b"property", b"vertex", b"face", b"list", b"comment", b"0", b"-1", b"1", b"9" * 400, b"x", b"\xff", b"")
+_WORDS = (
+    b"element",
+    b"property",
+    b"vertex",
+    b"face",
+    b"list",
+    b"comment",
+    b"0",
+    b"-1",
+    b"1",
+    b"9" * 400,
+    b"x",
+    b"\xff",
+    b"",
+)
 _WORDS += tuple(_CODES)
 
 
@@ -60,5 +74,13 @@ def seeds() -> Iterable[bytes]:
     yield _FILE.read_bytes().replace(b"end_header", b"element face 0\nend_header")
 
 
-ENCODERS = ("write_ply", "write_graph_npz", "prepare_out", "atomic_write", "_*result*", "_output_error", "MapLike.*")
+ENCODERS = (
+    "write_ply",
+    "write_graph_npz",
+    "prepare_out",
+    "atomic_write",
+    "_*result*",
+    "_output_error",
+    "MapLike.*",
+)
 TARGET = Target(run, mutate, seeds, {"dagmap.io.export": ENCODERS}, max_len=4096, generated=(b"",))

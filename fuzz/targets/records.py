@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from random import Random
 
+from dagmap.payload import decode_payload, encode_payload
+from dagmap.wire import Refusal
 from grammar import Flip
 from targets import Target
 from targets._wire import CONFIG, PAYLOAD, change, payloads
-
-from dagmap.payload import decode_payload, encode_payload
-from dagmap.wire import Refusal
 
 
 def run(data: bytes) -> bool:

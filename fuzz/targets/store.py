@@ -7,17 +7,17 @@ from collections.abc import Iterable
 from contextlib import closing
 from random import Random
 
+from dagmap.io.store import Store
+from dagmap.model import DagmapError
+from dagmap.transaction import id_of
 from grammar import Flip
 from targets import Target
 from targets._files import workplace, write
 from targets._wire import CONFIG, ROBOTS
 
-from dagmap.io.store import Store
-from dagmap.model import DagmapError
-from dagmap.transaction import id_of
-
 _FILE = workplace() / "robot.db"
 _VALUES = ("NULL", "1", "''", "x''", "x'00ff'", "'fleet'", "x'31'", "1.5", "x'32'")
+_ANEW = "DROP TABLE transactions; CREATE TABLE transactions (position, id, data);"
 _CHANGES = (
     "UPDATE meta SET value = {0} WHERE key = 'format'",
     "UPDATE meta SET value = {0}",
@@ -32,8 +32,7 @@ _CHANGES = (
     "ALTER TABLE transactions RENAME COLUMN data TO other",
     "ALTER TABLE meta RENAME COLUMN value TO other",
     "DROP TABLE meta; CREATE TABLE meta (key, value); INSERT INTO meta VALUES ({0}, {1})",
-    "DROP TABLE transactions; CREATE TABLE transactions (position, id, data);"
-    "INSERT INTO transactions VALUES ({0}, {1}, {0})",
+    _ANEW + "INSERT INTO transactions VALUES ({0}, {1}, {0})",
     "CREATE TABLE other (a)",
 )  # fmt: skip
 
@@ -78,7 +77,9 @@ def seeds() -> Iterable[bytes]:
             database.execute("CREATE TABLE a (a)")
             database.execute("DROP TABLE a")
         with Store.open(_FILE, CONFIG.fleet_id, author) as store:
-            store.append_many((id_of(data), data) for data in (bytes([i]) * 9 for i in range(count)))
+            store.append_many(
+                (id_of(data), data) for data in (bytes([i]) * 9 for i in range(count))
+            )
         yield _FILE.read_bytes()
 
 

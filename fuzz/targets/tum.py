@@ -1,4 +1,4 @@
-"""A TUM RGB-D folder: its lists, its camera, its pictures. An input is files one after the other."""
+"""A TUM RGB-D folder: lists, camera, pictures. An input is files one after the other."""
 
 from __future__ import annotations
 
@@ -12,23 +12,53 @@ from random import Random
 
 import cv2
 import numpy as np
-from grammar import Flip, many, mutate as mutate_tree, record, rest, sized, tree
-from targets import Target
-from targets._files import workplace
 
 from dagmap import wire
 from dagmap.io.sources import Options, tum
 from dagmap.model import DagmapError
 from dagmap.wire import Reader, Refusal
+from grammar import Flip, many, record, rest, sized, tree
+from grammar import mutate as mutate_tree
+from targets import Target
+from targets._files import workplace
 
 _HOME = workplace()
 _NAME = re.compile(r"((rgb|depth)/)?[A-Za-z0-9._-]{1,60}\Z")
 _FILES = many(record(sized(rest), sized(rest)))
 _WORDS = (
-    "0", "1", "1.02", "-1", "nan", "1e400", "1e300", "1_0", "x", "#", ",", "", "rgb/1.png", "rgb", "a" * 300, "\0", "../x",
-    "depth/1.png", "/", "\u0663", "9" * 5000, "\x1b[2J", "\u2028", "\n", "\r", "[" * 3000, "{}", '"fx": 1e999', "1" * 400,
-    "null", "true", "\\ud800",
-)  # fmt: skip
+    "0",
+    "1",
+    "1.02",
+    "-1",
+    "nan",
+    "1e400",
+    "1e300",
+    "1_0",
+    "x",
+    "#",
+    ",",
+    "",
+    "rgb/1.png",
+    "rgb",
+    "a" * 300,
+    "\0",
+    "../x",
+    "depth/1.png",
+    "/",
+    "\u0663",
+    "9" * 5000,
+    "\x1b[2J",
+    "\u2028",
+    "\n",
+    "\r",
+    "[" * 3000,
+    "{}",
+    '"fx": 1e999',
+    "1" * 400,
+    "null",
+    "true",
+    "\\ud800",
+)
 
 
 def run(data: bytes) -> bool:
@@ -104,15 +134,31 @@ def pack(files: Iterable[tuple[bytes, bytes]]) -> bytes:
 
 
 def seeds() -> Iterable[bytes]:
-    camera = {"fx": 20.0, "fy": 20.0, "cx": 20.0, "cy": 20.0, "width": 40, "height": 40, "depth_scale": 1000.0}
-    color = np.kron(np.random.default_rng(1).integers(0, 256, (5, 5), np.uint8), np.ones((8, 8), np.uint8))
-    png = [cv2.imencode(".png", picture)[1].tobytes() for picture in (color, np.full((40, 40), 2000, np.uint16))]
+    camera = {
+        "fx": 20.0,
+        "fy": 20.0,
+        "cx": 20.0,
+        "cy": 20.0,
+        "width": 40,
+        "height": 40,
+        "depth_scale": 1000.0,
+    }
+    color = np.kron(
+        np.random.default_rng(1).integers(0, 256, (5, 5), np.uint8), np.ones((8, 8), np.uint8)
+    )
+    png = [
+        cv2.imencode(".png", picture)[1].tobytes()
+        for picture in (color, np.full((40, 40), 2000, np.uint16))
+    ]
     jpg = cv2.imencode(".jpg", color)[1].tobytes()
     start = [(b"camera.json", json.dumps(camera).encode())]
     truth = (b"groundtruth.txt", b"# stamp pose\n1 0 0 0 0 0 0 1\n1.5,0,0,1,0,0,0,1\n")
     pictures = [(b"rgb/1.0.png", png[0]), (b"depth/1.01.png", png[1])]
     yield pack([*start, truth, *pictures])
-    listed = [(b"rgb.txt", b"1 rgb/1.0.png\n9 rgb/1.0.png\n"), (b"depth.txt", b"1.01 depth/1.01.png\n")]
+    listed = [
+        (b"rgb.txt", b"1 rgb/1.0.png\n9 rgb/1.0.png\n"),
+        (b"depth.txt", b"1.01 depth/1.01.png\n"),
+    ]
     yield pack([*start, truth, *pictures, *listed])
     named = (b"associations.txt", b"1 rgb/1.jpg 1.0 depth/1.01.png\n")
     yield pack([*start, truth, named, (b"rgb/1.jpg", jpg), pictures[1]])

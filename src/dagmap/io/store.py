@@ -227,7 +227,7 @@ def _explained(path: Path, trouble: str) -> Iterator[None]:
     """Turn what SQLite raises into StoreError with the file, the trouble and the remedy."""
     try:
         yield
-    except (sqlite3.Error, UnicodeDecodeError) as error:
-        text = " ".join(str(error).split())
+    except (sqlite3.Error, UnicodeDecodeError, MemoryError) as error:  # a damaged file asks for any
+        text = " ".join(str(error).split()) if isinstance(error, sqlite3.Error) else "malformed"
         remedy = next((words for part, words in _REMEDIES.items() if part in text), text)
         raise StoreError(f"{path}: {trouble}: {remedy} ({text})") from error

@@ -193,7 +193,9 @@ def _check_names(path: Path, names: set[str]) -> None:
         raise RecordingError(f"{path}: no array {missing[0]}; a cycle stream needs {_NEEDED}")
     unknown = sorted(names - set(_LAYOUT))
     if unknown:
-        raise RecordingError(f"{path}: unknown array {unknown[0][:60]!r}; known are {tuple(_LAYOUT)}")
+        raise RecordingError(
+            f"{path}: unknown array {unknown[0][:60]!r}; known are {tuple(_LAYOUT)}"
+        )
     for group in _TOGETHER:
         given = [name for name in group if name in names]
         if given and len(given) != len(group):
