@@ -97,9 +97,9 @@ $(LOCK)/bin/uv: | $(LOCK)/bin/python
 
 # numba notices a change in a kernel's own file, not in one that it calls from another file.
 clean-cache:
-	find src bench tests $(wildcard $(DEMO)) \( -name '*.nbi' -o -name '*.nbc' \) -delete
+	find src bench fuzz tests $(wildcard $(DEMO)) \( -name '*.nbi' -o -name '*.nbc' \) -delete
 
 clean: clean-cache
 	rm -rf $(DEMO) $(TEST) $(LOCK) out build dist .hypothesis .import_linter_cache .mypy_cache \
 	  .pytest_cache .ruff_cache .benchmarks
-	find src bench tests -name __pycache__ -prune -exec rm -rf {} +
+	find src bench fuzz tests -name __pycache__ -prune -exec rm -rf {} +

@@ -70,7 +70,7 @@ def mutate(data: bytes, rng: Random, flip: Flip) -> bytes:
 
 
 def seeds() -> Iterable[bytes]:
-    for author, count in ((None, 0), (ROBOTS[0].author, 3), (ROBOTS[1].author, 1)):
+    for author, count in ((None, 0), (ROBOTS[1].author, 1), (ROBOTS[0].author, 3)):
         _FILE.unlink(missing_ok=True)
         with closing(sqlite3.connect(_FILE)) as database:
             database.execute("PRAGMA page_size = 512")
@@ -80,6 +80,12 @@ def seeds() -> Iterable[bytes]:
             store.append_many(
                 (id_of(data), data) for data in (bytes([i]) * 9 for i in range(count))
             )
+        yield _FILE.read_bytes()
+    whole = _FILE.read_bytes()
+    for table in ("meta", "transactions"):
+        _FILE.write_bytes(whole)
+        with closing(sqlite3.connect(_FILE)) as database:
+            database.execute(f"DROP TABLE {table}")
         yield _FILE.read_bytes()
 
 

@@ -175,11 +175,14 @@ class Store:
             made = {sql for (sql,) in database.execute("SELECT sql FROM sqlite_master")}
             if not made and fleet_id is not None:
                 self._create(database, fleet_id)
-            elif not {_META, _TRANSACTIONS} <= made:
+                made = {_META, _TRANSACTIONS}
+            if _META not in made:
                 raise StoreError(
                     f"{self.path}: a database, but no DAGmap ledger; name another file"
                 )
             self._claim(database, fleet_id, author)
+            if _TRANSACTIONS not in made:
+                raise StoreError(f"{self.path}: the file is damaged (no table); {_AFRESH}")
 
     def _create(self, database: sqlite3.Connection, fleet_id: bytes) -> None:
         database.execute(_META)
