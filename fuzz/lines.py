@@ -84,7 +84,8 @@ class Tracer:
 def reached(names: list[str]) -> tuple[int, list[str]]:
     """Statements of these targets' parsers, and what of them the corpora do not reach."""
     parsers: dict[str, tuple[str, ...]] = {}
-    loaded = {name: targets.load(name) for name in names}
+    every = {name: targets.load(name) for name in names}
+    loaded = {name: target for name, target in every.items() if target.parsers}
     for target in loaded.values():
         parsers |= target.parsers
     files = {name: Path(str(import_module(name).__file__)) for name in parsers}

@@ -61,6 +61,7 @@ def run(data: bytes) -> bool:
         return False
     assert len(config.fleet_id) == len(config.parameters_id) == 8
     assert config.graph.pitch_mm > 0 and config.fold.cell_mm > 0 and config.fold.delta_mm > 0
+    assert config.fold.max_ray_mm >= 0
     Agent(ROBOTS[0], config)
     return True
 

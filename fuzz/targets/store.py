@@ -64,7 +64,7 @@ def mutate(data: bytes, rng: Random, flip: Flip) -> bytes:
     try:
         with closing(sqlite3.connect(_FILE)) as database:
             database.executescript(statement)
-    except sqlite3.Error:
+    except (sqlite3.Error, UnicodeDecodeError, MemoryError):
         return flip(data)
     return _FILE.read_bytes()
 
