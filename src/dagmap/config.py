@@ -244,3 +244,5 @@ def load_config(path: Path, kind: type[C] = Config) -> C:  # type: ignore[assign
         raise ConfigError(f"{path}: {error}") from None
     except msgspec.DecodeError as error:
         raise ConfigError(f"{path}: not valid TOML ({error})") from None
+    except (ValueError, RecursionError):  # Python's own limits, which its TOML reader lets through
+        raise ConfigError(f"{path}: a number is too long or something nested too deep") from None

@@ -161,7 +161,8 @@ def quantise_points(points: npt.ArrayLike, where: str = "points") -> Int32s:
         return np.zeros((0, 3), np.int32)
     if metres.ndim != 2 or metres.shape[1] != 3:
         raise CycleError(f"{where}: the shape is {metres.shape}; (N, 3) is wanted")
-    millimetres = np.floor(metres * 1000.0 + 0.5)
+    with np.errstate(over="ignore"):  # to infinity, which is refused
+        millimetres = np.floor(metres * 1000.0 + 0.5)
     bad = np.asarray(~(np.abs(millimetres) <= LIMIT_MM).all(axis=1))  # catches NaN too
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
@@ -184,7 +185,9 @@ def quantise_pose(pose: npt.ArrayLike, where: str = "pose") -> Int32s:
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise CycleError(f"{where}: a finite (4, 4) matrix is wanted, this is {matrix.tolist()}")
     rotation = matrix[:3, :3]
-    rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 and np.linalg.det(rotation) > 0
+    with np.errstate(over="ignore", invalid="ignore"):  # to infinity or NaN, which is not rigid
+        orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3
+    rigid = orthonormal and np.linalg.det(rotation) > 0
     if not rigid or np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
         raise CycleError(
             f"{where}: not a rigid motion (rotation must be orthonormal with determinant 1, "

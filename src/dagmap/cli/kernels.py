@@ -82,6 +82,7 @@ def warm_fold() -> None:
     fold.apply(block)
     rays.walk(0, origins, starts, places, alive, 1)
     fold.evaluate(rays)
+    rays.walk(0, origins, starts, places, alive, -1)  # else the first fork would wait for it
     fold.undo(block)
     rays.walk(0, origins, starts, places, alive, -1)  # frees what has become zero
 
