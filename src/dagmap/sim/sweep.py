@@ -133,9 +133,10 @@ def _attempt(item: tuple[Scenario, int]) -> Failure | None:
 def _simpler(failure: Failure) -> Iterator[Scenario]:
     """Scenarios with a little less in them, the largest cuts first."""
     full = failure.scenario
-    if failure.at < full.seconds:
-        yield msgspec.structs.replace(full, seconds=failure.at + 0.001)
-    yield msgspec.structs.replace(full, seconds=full.seconds * 0.6)
+    if failure.at + 0.001 < full.seconds:
+        yield _shorter(full, failure.at + 0.001)
+    if full.seconds * 0.6 > full.tick:
+        yield _shorter(full, full.seconds * 0.6)
     for name in ("partitions", "crashes"):
         yield from (
             msgspec.structs.replace(full, **{name: rest})
@@ -155,6 +156,11 @@ def _simpler(failure: Failure) -> Iterator[Scenario]:
     if full.motion.loop_closures:
         motion = msgspec.structs.replace(full.motion, loop_closures=False)
         yield msgspec.structs.replace(full, motion=motion)
+
+
+def _shorter(full: Scenario, seconds: float) -> Scenario:
+    late = tuple(min(at, seconds) for at in full.late)
+    return msgspec.structs.replace(full, seconds=seconds, late=late)
 
 
 def _without_one(items: tuple[T, ...]) -> Iterator[tuple[T, ...]]:
