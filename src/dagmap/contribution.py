@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from .config import Config
 from .fold import Block
@@ -23,6 +24,8 @@ from .transaction import Transaction
 Placement: TypeAlias = tuple[FrameId, Int32s]  # component, (7,) pose of a frame in it
 Frames: TypeAlias = Callable[[AuthorId, int], Placement]  # of an author's session
 Key: TypeAlias = tuple[int, AuthorId, int]  # the canonical order
+D = TypeVar("D", bound=np.generic)
+_NO_NUMBERS, _NO_CYCLES = np.zeros(0, np.int64), np.zeros(0, np.int32)
 
 
 @dataclass(slots=True)
@@ -135,21 +138,23 @@ class Contribution:
 
     def block(self, part: Part) -> Block:
         """The part in the form that a fold takes."""
-        sizes = np.diff(self.starts)
-        numbers = [s.numbers for s in part.sightings]
-        cycles = [np.full(len(s.numbers), s.cycle, np.int32) for s in part.sightings]
+        numbers, cycles = _NO_NUMBERS, _NO_CYCLES
+        if part.sightings:
+            numbers = np.concatenate([s.numbers for s in part.sightings])
+            sizes = [len(s.numbers) for s in part.sightings]
+            cycles = np.array([s.cycle for s in part.sightings], np.int32).repeat(sizes)
         return Block(
             author=self.author.index,
             base=self.base,
             xyz=self.xyz,
             alive=self.alive(part),
-            cycle=np.repeat(self.cycles, sizes).astype(np.int32),
+            cycle=self._each(self.cycles.astype(np.int32)),
             color=self.color,
-            colored=np.repeat(self.colored, sizes).astype(np.bool_),
+            colored=self._each(self.colored.astype(np.bool_)),
             parents=self.parents,
             cores=self.cores,
-            sightings=np.concatenate([np.zeros(0, np.int64), *numbers]),
-            sighting_cycle=np.concatenate([np.zeros(0, np.int32), *cycles]),
+            sightings=numbers,
+            sighting_cycle=cycles,
         )
 
     def alive(self, part: Part) -> Bools:
@@ -179,14 +184,16 @@ class Contribution:
         components = [*(home for home in homes if home is not None), *again][:1]
         parts = []
         for component in components:
-            mine = np.repeat(np.array([h == component for h in homes], np.bool_), self._sizes())
+            mine = self._each(np.array([h == component for h in homes], np.bool_))
             mine &= alive
             mask = None if bool(mine.all()) else mine
             parts.append(Part(component, mask, origins, tuple(again.get(component, ()))))
         return parts
 
-    def _sizes(self) -> Int64s:
-        return np.diff(self.starts)
+    def _each(self, of_segments: npt.NDArray[D]) -> npt.NDArray[D]:
+        """A value of every segment for each of its features."""
+        starts = self.starts
+        return of_segments.repeat(starts[1:] - starts[:-1])
 
 
 def _through(

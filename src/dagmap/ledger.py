@@ -61,6 +61,7 @@ class Ledger:
     def __init__(self, config: Config) -> None:
         self._config = config
         self.chains: dict[AuthorId, Chain] = {}
+        self.changed: set[AuthorId] = set()  # whose chain did, since its reader cleared this
         self._known: dict[TransactionId, Transaction] = {}
         self._features: dict[TransactionId, int] = {}  # the author's features up to and with it
         self._waiting: OrderedDict[TransactionId, tuple[Transaction, set[TransactionId]]]
@@ -198,6 +199,7 @@ class Ledger:
 
     def _accept(self, tx: Transaction) -> None:
         chain = self.chains.setdefault(tx.author, Chain())
+        self.changed.add(tx.author)
         before = 0 if tx.previous is None else self._features[tx.previous]
         self._known[tx.id] = tx
         self._features[tx.id] = before + tx.features
@@ -236,6 +238,7 @@ class Ledger:
         if rival is not None and (chain.cut is None or tx.sequence < chain.cut):
             chain = self.chains.setdefault(tx.author, chain)
             chain.cut, chain.proof = tx.sequence, (rival, tx)
+            self.changed.add(tx.author)
             outcome.forked.append((tx.author, tx.sequence))
 
     def _rival(self, chain: Chain, tx: Transaction) -> Transaction | None:

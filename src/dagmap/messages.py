@@ -11,7 +11,7 @@ from __future__ import annotations
 import zlib
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from . import wire
 from .config import Config
@@ -42,8 +42,7 @@ class Transactions:
     more: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Head:
+class Head(NamedTuple):
     """The end of an author's chain as the sender holds it; `cut` where it holds a fork proof."""
 
     author: AuthorId

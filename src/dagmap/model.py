@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum, IntEnum
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -62,8 +62,7 @@ AuthorId: TypeAlias = bytes  # 8 bytes: the head of the BLAKE2b-256 of the autho
 TransactionId: TypeAlias = bytes  # 32 bytes: the BLAKE2b-256 of the exact bytes
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class FrameId:
+class FrameId(NamedTuple):
     """A SLAM frame: one per author and session. The fleet's own frame is that of author zero."""
 
     author: AuthorId

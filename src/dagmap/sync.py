@@ -41,6 +41,7 @@ class Sync:
         self._ledger, self._config, self._me = ledger, config.sync, me
         self.peers: OrderedDict[AuthorId, Peer] = OrderedDict()
         self._next_announcement: float | None = None
+        self._heads: dict[AuthorId, Head] = {}
         self._token = 0
         self._sent_at: OrderedDict[int, float] = OrderedDict()
         self._asked: OrderedDict[AuthorId, tuple[int, float]] = (
@@ -53,6 +54,7 @@ class Sync:
         if self._next_announcement is None or now >= self._next_announcement:
             self._next_announcement = now + self._config.announce_period
             yield from self._announce(now)
+        yield from self._ask_again(now)
         yield from self._ask_for_missing(now)
 
     def heard(self, sender: AuthorId, message: Heads, now: float) -> Iterator[Post]:
@@ -63,13 +65,15 @@ class Sync:
         if message.token != peer.token:
             peer.heads.clear()  # an announcement of several messages has one token
         peer.token, peer.heard = message.token, now
-        waiting = self._ledger.waiting_from()
+        held, waiting = self._held(), self._ledger.waiting_from()
         for head in message.heads:
+            if held.get(head[0]) == head:  # nearly all, in a fleet that agrees
+                continue
             if len(peer.heads) < _MAX_HEADS and self._promises(head, waiting):
                 peer.heads[head.author] = head
-        for whose, token, held in message.echoes:
+        for whose, token, kept in message.echoes:
             if whose == self._me and token in self._sent_at:
-                delay = max(0.0, now - self._sent_at[token] - held / 1e6) / 2
+                delay = max(0.0, now - self._sent_at[token] - kept / 1e6) / 2
                 peer.delay = delay if peer.delay is None else 0.75 * peer.delay + 0.25 * delay
         yield from self._ask(sender, peer, now)
 
@@ -118,16 +122,7 @@ class Sync:
         return peer
 
     def _announce(self, now: float) -> Iterator[Post]:
-        heads = [
-            Head(
-                author,
-                chain.end,
-                _tip(chain.main[chain.end - 1].id if chain.end else b""),
-                chain.cut,
-            )
-            for author, chain in self._ledger.chains.items()
-            if chain.end or chain.cut is not None
-        ]
+        heads = [head for head in self._held().values() if head.length or head.cut is not None]
         self._token += 1
         self._sent_at[self._token] = now
         while len(self._sent_at) > 64:
@@ -137,21 +132,47 @@ class Sync:
         for first in range(0, max(len(heads), 1), _MAX_HEADS):
             yield Heads(self._token, echoes, tuple(heads[first : first + _MAX_HEADS])), None
 
-    def _ask(self, sender: AuthorId, peer: Peer, now: float) -> Iterator[Post]:
+    def _held(self) -> dict[AuthorId, Head]:
+        """The ends of the chains as they stand here."""
+        for author in sorted(self._ledger.changed):
+            chain = self._ledger.chain(author)
+            tip = _tip(chain.main[chain.end - 1].id if chain.end else b"")
+            self._heads[author] = Head(author, chain.end, tip, chain.cut)
+        self._ledger.changed.clear()
+        return self._heads
+
+    def _ask_again(self, now: float) -> Iterator[Post]:
+        """Where an answer is overdue, ask another robot that has promised the same."""
+        late = [author for author, (_, until) in self._asked.items() if now >= until]
+        for sender, peer in list(self.peers.items()) if late else ():
+            overdue = {author: peer.heads[author] for author in late if author in peer.heads}
+            if overdue:
+                self.peers.move_to_end(sender)
+                yield from self._ask(sender, peer, now, overdue)
+                late = [author for author in late if author not in overdue]
+
+    def _ask(
+        self, sender: AuthorId, peer: Peer, now: float, heads: dict[AuthorId, Head] | None = None
+    ) -> Iterator[Post]:
         ranges, proofs = [], []
         waiting = self._ledger.waiting_from()
-        for head in peer.heads.values():
+        for head in (peer.heads if heads is None else heads).values():
             if self._proves(head):
                 proofs.append(head.author)
             wanted = self._wanted(head, waiting)
             if wanted is not None and now >= self._asked.get(head.author, (0, now))[1]:
-                self._asked[head.author] = (wanted[1], now + self._config.retry_period)
+                self._asked[head.author] = (wanted[1], now + self._patience(peer))
                 self._asked.move_to_end(head.author)
                 if len(self._asked) > 2 * _MAX_HEADS:
                     self._asked.popitem(last=False)
                 ranges.append((head.author, *wanted))
         if ranges or proofs:
             yield Want(tuple(ranges), (), tuple(proofs)), sender
+
+    def _patience(self, peer: Peer) -> float:
+        """How long an answer may take, s: a few round trips, where they were measured."""
+        longest = self._config.retry_period
+        return longest if peer.delay is None else min(longest, max(0.3, 8 * peer.delay))
 
     def _promises(self, head: Head, waiting: dict[AuthorId, int]) -> bool:
         return self._proves(head) or self._wanted(head, waiting) is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from math import isqrt
 
 import numpy as np
@@ -56,25 +57,34 @@ def apply_pose(pose: Int32s, points: Int32s, out: Int32s, inside: Bools) -> None
 
 def compose(outer: Int32s, inner: Int32s) -> Int32s:
     """The pose that applies `inner`, then `outer`; the translation saturates at +-2^29 mm."""
-    a, b = outer.tolist(), inner.tolist()
+    return np.array(_composed(tuple(outer.tolist()), tuple(inner.tolist())), np.int32)
+
+
+@lru_cache(maxsize=4096)
+def _composed(a: tuple[int, ...], b: tuple[int, ...]) -> tuple[int, ...]:
     w = a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3]
     x = a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2]
     y = a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1]
     z = a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0]
     quaternion = _normalised((w, x, y, z))
-    return np.array(quaternion + _moved(outer, b[4:]), np.int32)
+    return quaternion + _moved(a, b[4:])
 
 
 def invert(pose: Int32s) -> Int32s:
     """The pose that undoes `pose`, to the rounding of a millimetre."""
-    w, x, y, z, *translation = pose.tolist()
-    back = np.array([w, -x, -y, -z, 0, 0, 0], np.int32)
-    return np.array((w, -x, -y, -z, *_moved(back, [-t for t in translation])), np.int32)
+    return np.array(_inverse(tuple(pose.tolist())), np.int32)
 
 
-def _moved(pose: Int32s, place: list[int]) -> tuple[int, ...]:
+@lru_cache(maxsize=4096)
+def _inverse(pose: tuple[int, ...]) -> tuple[int, ...]:
+    w, x, y, z, *translation = pose
+    back = (w, -x, -y, -z)
+    return back + _moved((*back, 0, 0, 0), tuple(-t for t in translation))
+
+
+def _moved(pose: tuple[int, ...], place: tuple[int, ...]) -> tuple[int, ...]:
     """One place through a pose, in Python's unbounded integers, saturating."""
-    r, t = rotation(pose).tolist(), pose[4:].tolist()
+    r, t = rotation(np.array(pose, np.int32)).tolist(), pose[4:]
     rows = (r[0:3], r[3:6], r[6:9])
     moved = (
         ((sum(a * b for a, b in zip(row, place, strict=True)) + _HALF) >> _SHIFT) + offset

@@ -133,10 +133,9 @@ def _attempt(item: tuple[Scenario, int]) -> Failure | None:
 def _simpler(failure: Failure) -> Iterator[Scenario]:
     """Scenarios with a little less in them, the largest cuts first."""
     full = failure.scenario
-    if failure.at + 0.001 < full.seconds:
-        yield _shorter(full, failure.at + 0.001)
-    if full.seconds * 0.6 > full.tick:
-        yield _shorter(full, full.seconds * 0.6)
+    for seconds in (round(failure.at + 0.001, 3), round(full.seconds * 0.6, 3)):
+        if 0 < seconds < full.seconds:
+            yield _shorter(full, seconds)
     for name in ("partitions", "crashes"):
         yield from (
             msgspec.structs.replace(full, **{name: rest})
