@@ -2,6 +2,7 @@
 # versions and with the hashes that requirements/*.txt name, into .venv-demo or .venv beside this file.
 #
 #   make demo         replay the office with three robots; results in out/office
+#   make fleet        the same as three processes that talk over the network; see examples/fleet
 #   make test         make check, then the test suite
 #   make check        ruff, mypy, import-linter
 #   make bench        measure the speed (dagmap bench)
@@ -28,11 +29,14 @@ OFFICE := examples/office/robot1 examples/office/robot2 examples/office/robot3
 # A sourced ROS workspace sets PYTHONPATH; its packages must not mix with those of the environments.
 unexport PYTHONPATH
 
-.PHONY: demo test check bench lock clean clean-cache
+.PHONY: demo fleet test check bench lock clean clean-cache
 .DELETE_ON_ERROR:
 
 demo: $(DEMO)/.package
 	@$(DEMO)/bin/dagmap replay $(OFFICE) --out out/office --force
+
+fleet: $(DEMO)/.package
+	@examples/fleet/run $(DEMO)/bin/dagmap
 
 test: check
 	NUMBA_DISABLE_JIT=1 $(TEST)/bin/python -m pytest -q -n 2 $(TWINS)
@@ -78,7 +82,7 @@ $(DEMO)/bin/python $(TEST)/bin/python $(LOCK)/bin/python:
 	  $(PYTHON) -m pip --python $@ -qq install pip; fi
 
 lock: $(LOCK)/bin/uv
-	$(COMPILE) --extra rgbd --extra report --output-file requirements/demo.txt
+	$(COMPILE) --extra fleet --extra rgbd --extra report --output-file requirements/demo.txt
 	$(COMPILE) --extra dev --constraint requirements/demo.txt --output-file requirements/test.txt
 	@! grep -n '://' requirements/*.txt || { echo "An address in a lock file, see above" >&2; exit 1; }
 

@@ -69,15 +69,22 @@ def test_what_only_liars_say_is_confirmed_from_witnesses_liars_on(
         assert beyond is not None and beyond.liars_confirmed > 0, "one liar more and the bound ends"
 
 
-@pytest.mark.parametrize("kind", SAYING)
+@pytest.mark.parametrize("kind", ["forger", "eraser", "wrong-frame"])
 @pytest.mark.parametrize("liars", [1, 2])
 def test_what_outweighs_the_liars_is_never_lost(kind: str, liars: int) -> None:
     lies = played(room(kind, liars))[1].lies
     assert lies is not None and lies.proven_nodes > 50 and lies.proven_lost == 0
 
 
+@pytest.mark.parametrize("seed", [2, 3])
+def test_splitting_what_others_saw_gains_next_to_nothing(seed: int) -> None:
+    """Seeds planted beside a place can share its hits out among nodes that are outvoted apart."""
+    lies = played(room("splitter", 1), seed)[1].lies
+    assert lies is not None and lies.proven_lost <= lies.proven_nodes // 100
+
+
 def test_one_witness_less_and_it_is_lost() -> None:
-    """Erasers outvote places where honest hits exceed honest misses by no more than their number."""
+    """Erasers outvote places where honest hits exceed honest misses by no more than they are."""
     mission, _ = played(room("eraser", 3))
     honest = mission.honest
     assert judge_lies(honest[0], honest, liars=3).proven_lost == 0
@@ -88,7 +95,6 @@ def test_one_witness_less_and_it_is_lost() -> None:
     ("kind", "reason"),
     [
         ("wrong-prover", "signature does not match"),
-        ("forker", "beyond a proven fork of its author"),
         ("false-dater", "Lamport time does not follow from its references"),
         ("babbler", "checksum does not match"),
     ],
@@ -97,6 +103,14 @@ def test_a_refusal_says_why(kind: str, reason: str) -> None:
     few = msgspec.structs.replace(ROOM.sensor, points=20)
     report = played(room(kind, 1, seconds=8.0, sensor=few))[1]
     assert report.rejected.get(reason, 0) > 0, report.rejected
+
+
+def test_a_fork_is_cut_on_every_robot() -> None:
+    few = msgspec.structs.replace(ROOM.sensor, points=20)
+    mission, _ = played(room("forker", 1, seconds=8.0, sensor=few))
+    liar = mission.fleet.robots["forker00"].author
+    cuts = {robot.agent.ledger.chain(liar).cut for robot in mission.honest}
+    assert len(cuts) == 1 and cuts != {None}
 
 
 def test_a_flood_stays_within_the_waiting_room() -> None:

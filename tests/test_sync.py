@@ -6,7 +6,7 @@ import random
 from collections.abc import Callable
 
 from dagmap import Agent, Cycle
-from dagmap.messages import Heads, Transactions, Want, parse
+from dagmap.messages import Heads, Transactions, Want, encode, parse
 from scene import agent, cycles, pose
 
 Carries = Callable[[str, str], bool]
@@ -120,6 +120,30 @@ def test_answers_come_in_chunks_and_the_asker_asks_on() -> None:
     assert taker.digest() == giver.digest()
     wants = [m for m in radio.log if isinstance(m, Want)]
     assert len(wants) >= 2 and any(m.more for m in radio.log if isinstance(m, Transactions))
+
+
+def test_an_answer_that_is_coming_in_is_not_asked_for_again() -> None:
+    giver, taker = agent("giver"), agent("taker")
+    for cycle in cycles(1):
+        giver.observe(cycle, cycle.stamp)
+    giver.tick(9.0)
+    chain = [tx.data for tx in giver.ledger]
+    taker.tick(0.0)
+    taker.receive(giver.outbox()[-1].data, 0.0)  # the announcement
+
+    def asked(now: float) -> list[Want]:
+        taker.tick(now)
+        said = (parse(out.data, taker.config)[1] for out in taker.outbox())
+        return [message for message in said if isinstance(message, Want)]
+
+    me, them = giver.identity.author, taker.config
+    patience = them.sync.retry_period
+    assert asked(0.1) == [Want(((me, 0, len(chain)),))]
+    for i in range(3):  # slowly: each part takes nearly as long as an answer may
+        now = 0.9 * patience * (i + 1)
+        taker.receive(encode(Transactions((chain[i],)), them, me), now)
+        assert asked(now + 0.05) == []
+    assert asked(now + patience + 0.05) == [Want(((me, 3, len(chain)),))]  # the rest was lost
 
 
 def test_repair_of_a_gap_asks_for_the_gap_only() -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import msgspec
 
@@ -201,10 +201,16 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return hashlib.blake2b(b"dagmap parameters 1\0" + shared, digest_size=8).digest()
 
 
-def load_config(path: Path) -> Config:
-    """Read a TOML file. Raises ConfigError that names the file, the key and what is wanted."""
+C = TypeVar("C", bound=Config)
+
+
+def load_config(path: Path, kind: type[C] = Config) -> C:  # type: ignore[assignment]
+    """Read a TOML file. Raises ConfigError that names the file, the key and what is wanted.
+
+    kind: a kind of `Config` with further tables, where the file has them.
+    """
     try:
-        return msgspec.toml.decode(path.read_bytes(), type=Config)
+        return msgspec.toml.decode(path.read_bytes(), type=kind)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError:

@@ -103,6 +103,17 @@ def parse(data: bytes, config: Config) -> tuple[AuthorId, Message]:
         raise Refusal(refusal.reason, refusal.detail, sender) from None
 
 
+def kind_of(data: bytes) -> Kind | None:
+    """The kind that a message's head names, before anything of it is checked."""
+    kind = data[3] if len(data) > 3 else 0
+    return Kind(kind) if kind in Kind.__members__.values() else None
+
+
+def sender_of(data: bytes) -> AuthorId:
+    """The sender that a message's head names: a hint. Shorter than 8 bytes where it is cut."""
+    return data[_HEAD - 8 : _HEAD]
+
+
 def _encode_body(message: Message) -> tuple[Kind, bytes]:
     if isinstance(message, Transactions):
         parts = [wire.number(len(data)) + data for data in message.data]

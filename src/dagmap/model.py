@@ -50,6 +50,10 @@ class StoreError(DagmapError):
     """A ledger on disk cannot be opened, read or written."""
 
 
+class NetworkError(DagmapError):
+    """The fleet's network cannot be opened."""
+
+
 class State(IntEnum):
     """What the fleet thinks of a node (section 4.3); the numbers stand in `map.ply`."""
 

@@ -44,9 +44,9 @@ class Sync:
         self._heads: dict[AuthorId, Head] = {}
         self._token = 0
         self._sent_at: OrderedDict[int, float] = OrderedDict()
-        self._asked: OrderedDict[AuthorId, tuple[int, float]] = (
+        self._asked: OrderedDict[AuthorId, tuple[int, int, float]] = (
             OrderedDict()
-        )  # chain: (end asked for, asked until)
+        )  # chain: (held, end asked for, asked until)
         self._asked_ids: dict[TransactionId, float] = {}  # id: not to be asked for before
 
     def tick(self, now: float) -> Iterator[Post]:
@@ -79,10 +79,13 @@ class Sync:
 
     def answered(self, sender: AuthorId, message: Transactions, now: float) -> Iterator[Post]:
         """Transactions came (they are in the ledger by now): ask on where the answer was cut."""
-        for author, (end, _) in list(self._asked.items()):
-            if len(self._ledger.chain(author).main) >= end:
-                del self._asked[author]
         peer = self.peers.get(sender)
+        for author, (begin, end, _) in list(self._asked.items()):
+            length = len(self._ledger.chain(author).main)
+            if length >= end:
+                del self._asked[author]
+            elif length > begin:  # the answer is coming: what is left of it gets its time too
+                self._asked[author] = length, end, now + self._patience(peer or Peer())
         if message.more and peer is not None:
             for author in peer.heads:
                 self._asked.pop(author, None)
@@ -143,7 +146,7 @@ class Sync:
 
     def _ask_again(self, now: float) -> Iterator[Post]:
         """Where an answer is overdue, ask another robot that has promised the same."""
-        late = [author for author, (_, until) in self._asked.items() if now >= until]
+        late = [author for author, (_, _, until) in self._asked.items() if now >= until]
         for sender, peer in list(self.peers.items()) if late else ():
             overdue = {author: peer.heads[author] for author in late if author in peer.heads}
             if overdue:
@@ -160,8 +163,8 @@ class Sync:
             if self._proves(head):
                 proofs.append(head.author)
             wanted = self._wanted(head, waiting)
-            if wanted is not None and now >= self._asked.get(head.author, (0, now))[1]:
-                self._asked[head.author] = (wanted[1], now + self._patience(peer))
+            if wanted is not None and now >= self._asked.get(head.author, (0, 0, now))[2]:
+                self._asked[head.author] = *wanted, now + self._patience(peer)
                 self._asked.move_to_end(head.author)
                 if len(self._asked) > 2 * _MAX_HEADS:
                     self._asked.popitem(last=False)

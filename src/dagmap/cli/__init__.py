@@ -63,6 +63,44 @@ def replay(
 
 
 @app.command()
+def agent(
+    config: Annotated[Path, typer.Argument(help="TOML file of this robot, see docs/fleet.md.")],
+    speed: Annotated[float, typer.Option(help="Play the recording so many times as fast.")] = 1.0,
+    wait_for: Annotated[
+        int, typer.Option(help="Begin the recording when so many other robots are in reach.")
+    ] = 0,
+    until_agreed: Annotated[
+        float | None,
+        typer.Option(
+            help="End once the recording is over and there was no news for so many seconds; "
+            "default: go on and serve."
+        ),
+    ] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Check the file, compile the kernels, and end.")
+    ] = False,
+    log: Annotated[str, typer.Option(help="debug, info, warning or error.")] = "info",
+    json: Annotated[bool, typer.Option("--json", help="At the end, print the status.")] = False,
+) -> None:
+    """Run one robot: its SLAM or a recording in, the fleet's map kept on disk and shared."""
+    from .agent import AgentCommand, level_named
+
+    level = level_named(log)
+    raise typer.Exit(AgentCommand(config, speed, wait_for, until_agreed, check, level, json).run())
+
+
+@app.command()
+def status(
+    target: Annotated[Path, typer.Argument(help="The agent's TOML file, or its status socket.")],
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Ask a running agent for its digest, heads, peers, lag and traffic."""
+    from .status import show_status
+
+    raise typer.Exit(show_status(target, json))
+
+
+@app.command()
 def evaluate(
     map: Annotated[Path, typer.Argument(help="The map: PLY or NPZ.")],  # noqa: A002
     reference: Annotated[Path, typer.Option(help="What is true: PLY or NPZ, in the same frame.")],

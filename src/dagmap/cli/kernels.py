@@ -83,6 +83,7 @@ def warm_fold() -> None:
     rays.walk(0, origins, starts, places, alive, 1)
     fold.evaluate(rays)
     fold.undo(block)
+    rays.walk(0, origins, starts, places, alive, -1)  # frees what has become zero
 
 
 def _compiled_before() -> bool:

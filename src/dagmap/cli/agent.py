@@ -1,0 +1,167 @@
+"""`dagmap agent`: one robot as one process, from its configuration file to the fleet's network."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from types import FrameType
+
+from rich.console import Console
+from rich.progress import track
+
+from ..agent import Agent
+from ..io.data_folder import next_session, open_folder, restore
+from ..io.log import Level, Log
+from ..io.metrics import MetricsServer
+from ..io.player import Player
+from ..io.queues import Inbox
+from ..io.runtime import Runtime
+from ..io.settings import Settings, load_settings
+from ..io.sources import Source, open_source
+from ..io.status import StatusServer, report
+from ..io.transport import Transport, load_zenoh
+from ..model import ConfigError, DagmapError
+from .kernels import warm_up
+
+
+@dataclass(slots=True)
+class AgentCommand:
+    """One run of the command. `run` returns its exit code."""
+
+    config_file: Path
+    speed: float
+    wait_for: int
+    until_agreed: float | None
+    check: bool
+    level: Level
+    json: bool
+    console: Console = field(default_factory=lambda: Console(stderr=True))
+
+    def run(self) -> int:
+        """0: stopped, or agreed. Raises DagmapError."""
+        if not self.speed > 0:
+            raise DagmapError(f"--speed {self.speed}: more than 0 is wanted; 1 is as recorded")
+        settings = load_settings(self.config_file)
+        load_zenoh()
+        source = self._open_source(settings)
+        warm_up(self.console)
+        if self.check:
+            self.console.print(f"{self.config_file}: all right")
+            return 0
+        log = Log(sys.stderr, self.level)
+        with ExitStack() as stack:
+            runtime, transport, player = self._assemble(settings, source, log, stack)
+            if player is not None:
+                player.start()
+                stack.callback(player.stop)
+            with _signals(runtime, log):
+                runtime.run(player, self.until_agreed)
+            answer = report(runtime, transport)
+        log.write("info", "stopped", transactions=len(runtime.agent.ledger))
+        sys.stdout.write(json.dumps(answer) + "\n" if self.json else _farewell(answer))
+        return 0
+
+    def _open_source(self, settings: Settings) -> Source | None:
+        table = settings.config.source
+        if table is None:
+            return None
+        camera = None if table.camera is None else settings.at(table.camera)
+        return open_source(settings.at(table.path), camera=camera, max_features=table.max_features)
+
+    def _assemble(
+        self, settings: Settings, source: Source | None, log: Log, stack: ExitStack
+    ) -> tuple[Runtime, Transport, Player | None]:
+        """Everything but the first cycle. What is opened here closes with the stack."""
+        config = settings.config
+        identity, store = open_folder(settings)
+        stack.enter_context(store)
+        agent = restore(settings, identity, store, self._track)
+        session = next_session(agent)
+        inbox = Inbox(config.network.receive_bytes, config.network.receive_bytes_per_robot)
+        transport = stack.enter_context(
+            Transport(config.network, settings.folder, config.fleet_id, identity.author, inbox)
+        )
+        runtime = Runtime(agent, store, transport, inbox, log, partial(_report, transport))
+        stack.enter_context(StatusServer(settings.control, inbox))
+        if (address := config.metrics.address) is not None:
+            stack.enter_context(MetricsServer(address, runtime, transport))
+        _log_start(log, agent, settings, session)
+        if source is None:
+            return runtime, transport, None
+        ready = partial(_enough, transport, self.wait_for)
+        return runtime, transport, Player(source, inbox, self.speed, session, ready)
+
+    def _track(self, transactions: Iterable[bytes], total: int) -> Iterable[bytes]:
+        """The progress bar of a restart."""
+        return track(
+            transactions,
+            "reading the ledger",
+            total,
+            console=self.console,
+            transient=True,
+            disable=not (total and self.console.is_terminal),
+        )
+
+
+def _report(transport: Transport, runtime: Runtime) -> dict[str, object]:
+    return report(runtime, transport)
+
+
+def _enough(transport: Transport, robots: int) -> bool:
+    return len(transport.here) >= robots
+
+
+def _log_start(log: Log, agent: Agent, settings: Settings, session: int) -> None:
+    log.write(
+        "info",
+        "started",
+        name=agent.config.name,
+        author=agent.identity.author.hex(),
+        fleet=agent.config.fleet,
+        ledger=settings.ledger,
+        transactions=len(agent.ledger),
+        session=session,
+    )
+    log.write(
+        "warning",
+        "open mode",
+        meaning="any key may take part: no bound against liars holds; for a first try only",
+    )
+
+
+@contextmanager
+def _signals(runtime: Runtime, log: Log) -> Iterator[None]:
+    """The first SIGINT or SIGTERM finishes the step and stops; the second one kills."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        for each in before:
+            signal.signal(each, signal.SIG_DFL)
+        runtime.stop()
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number in before:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _farewell(answer: dict[str, object]) -> str:
+    return f"{answer['name']}: {answer['transactions']} transactions, digest {answer['digest']}\n"
+
+
+def level_named(name: str) -> Level:
+    """A level of the log. Raises ConfigError for another word."""
+    levels: tuple[Level, ...] = ("debug", "info", "warning", "error")
+    for level in levels:
+        if level == name:
+            return level
+    raise ConfigError(f"--log {name}: one of {', '.join(levels)} is wanted")

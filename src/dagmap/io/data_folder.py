@@ -1,0 +1,101 @@
+"""A robot's data folder: its key, its ledger, and the agent that goes on from them."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+
+from ..agent import Agent
+from ..identity import Identity
+from ..model import StoreError
+from ..transaction import id_of
+from .settings import Settings
+from .store import Store
+
+Track = Callable[[Iterable[bytes], int], Iterable[bytes]]
+_KEY = "robot.key"
+
+
+def load_identity(folder: Path) -> Identity:
+    """The robot's identity in the open mode: a key that is made at the first start and kept.
+
+    Raises StoreError where the key is damaged, readable for others or cannot be written.
+    """
+    path = folder / _KEY
+    try:
+        if not path.exists():
+            _write_secret(path, secrets.token_hex(32))
+        if path.stat().st_mode & 0o077:
+            raise StoreError(f"{path}: others can read this private key; run chmod 600 on it")
+        return Identity.from_seed(bytes.fromhex(path.read_text("ascii")))
+    except OSError as error:
+        raise StoreError(f"{path}: the robot's key is out of reach ({error.strerror})") from None
+    except ValueError:
+        raise StoreError(
+            f"{path}: damaged, 64 hexadecimal digits are wanted; restore it from a backup, or give "
+            "the robot a new data folder"
+        ) from None
+
+
+def open_folder(settings: Settings) -> tuple[Identity, Store]:
+    """The robot's key and its open ledger, both made where this is the first start."""
+    path, fleet = settings.ledger, settings.config.fleet_id
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise StoreError(f"{path.parent}: cannot be made ({error.strerror})") from None
+    if not path.exists():
+        if (path.parent / _KEY).exists():
+            raise StoreError(
+                f"{path}: the ledger of the key beside it is gone; restore it from a backup, or "
+                f"remove {_KEY} too: the robot then starts as a new one. Under its old key it "
+                "would sign its numbers twice"
+            )
+        Store.open(path, fleet).close()  # first of all, so that a key without a ledger is a loss
+    identity = load_identity(path.parent)
+    return identity, Store.open(path, fleet, identity.author)
+
+
+def restore(settings: Settings, identity: Identity, store: Store, track: Track) -> Agent:
+    """The agent that holds what the ledger holds. Raises StoreError where it would hold less.
+
+    track: wraps the transactions (their number is known) to show how far it is.
+    """
+    agent = Agent.restore(identity, settings.config, track(store, len(store)))
+    lost = sum(agent.ledger.find(id_of(data)) is None for data in store)
+    if lost:
+        raise StoreError(
+            f"{store.path}: {lost} of {len(store)} transactions do not hold under this "
+            "configuration; the ledger was written with other fleet-wide parameters ([fold], "
+            "[transaction], graph.n_p, graph.n_c_max): give it back those, or another data folder"
+        )
+    return agent
+
+
+def next_session(agent: Agent) -> int:
+    """The first number for a SLAM that starts anew with this agent: no session has it yet."""
+    chain = agent.ledger.chain(agent.identity.author).main
+    used = (anchor.session for tx in chain for anchor in tx.payload.anchors)
+    return max(used, default=-1) + 1
+
+
+def _write_secret(path: Path, text: str) -> None:
+    """A file for this user only, there as a whole or not at all."""
+    part = path.with_suffix(".part")
+    with suppress(FileNotFoundError):
+        part.unlink()
+    handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    try:
+        os.write(handle, text.encode("ascii"))
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+    os.rename(part, path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)

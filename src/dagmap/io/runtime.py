@@ -1,0 +1,233 @@
+"""The thread that owns an agent: time and bytes in, the ledger and the network out.
+
+One step: what came in goes through the agent, what it accepted goes to the disk in one SQLite
+transaction, and only then does anybody hear of it. Nothing in a step waits for the network.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from ..agent import Agent
+from ..messages import Kind, kind_of
+from ..model import (
+    Accepted,
+    AuthorId,
+    Cycle,
+    CycleError,
+    DagmapError,
+    Event,
+    Forked,
+    Issued,
+    Outgoing,
+    Reason,
+    Rejected,
+    TransactionId,
+)
+from .log import Log
+from .queues import Inbox, Question
+
+TICK = 0.05  # s between the ticks of an agent
+_STATE_PERIOD = 5.0  # s between two lines of the log that say how it stands
+
+
+class Ledger(Protocol):
+    """What keeps transactions: `Store` does."""
+
+    def append_many(self, transactions: Iterable[tuple[TransactionId, bytes]]) -> None: ...
+
+
+class Network(Protocol):
+    """What carries messages: `Transport` does."""
+
+    @property
+    def here(self) -> frozenset[AuthorId]: ...
+    @property
+    def waiting_bytes(self) -> int: ...
+    def send(self, messages: Iterable[Outgoing]) -> None: ...
+
+
+class Slam(Protocol):
+    """What hands cycles to the inbox: `Player` does."""
+
+    error: DagmapError | None
+
+    @property
+    def over(self) -> bool: ...
+
+
+@dataclass(slots=True)
+class Counts:
+    """What happened since the start. Written by the agent's thread, read by any."""
+
+    cycles: int = 0
+    points: int = 0  # that the SLAM handed in
+    features: int = 0  # that went out in own transactions
+    issued: int = 0  # own transactions
+    stored: int = 0  # transactions of all authors
+    observe_s: float = 0.0  # spent in `Agent.observe`, in all
+    observe_max_s: float = 0.0
+    refused: Counter[Reason] = field(default_factory=Counter)
+
+
+class Runtime:
+    """Drives one agent. `run` returns once it is told to stop or has nothing more to wait for."""
+
+    def __init__(
+        self,
+        agent: Agent,
+        store: Ledger,
+        network: Network,
+        inbox: Inbox,
+        log: Log,
+        report: Callable[[Runtime], dict[str, object]],
+    ) -> None:
+        """report: the answer to a question that somebody puts into the inbox."""
+        self.agent, self.network, self.inbox = agent, network, inbox
+        self._store, self._log, self._report = store, log, report
+        self.counts = Counts()
+        self.started = time.monotonic()
+        self._next_tick = self._next_state = self.started
+        self._last_news = 0.0  # on the agent's clock
+        self._stopping = False
+
+    @property
+    def now(self) -> float:
+        """The agent's clock: seconds since the start, which no one sets back."""
+        return time.monotonic() - self.started
+
+    def stop(self) -> None:
+        """Finish the step and return from `run`. To be called from a signal handler, too."""
+        self._stopping = True
+
+    def run(self, slam: Slam | None = None, until_agreed: float | None = None) -> None:
+        """Work until stopped.
+
+        slam: where cycles come from; None: from nowhere, the robot only listens.
+        until_agreed: return as well once the SLAM is over and everybody in reach has announced
+            itself, but asked and told nothing new for so many seconds. None: go on and serve.
+        Raises StoreError (nothing that is not stored was sent) and what the SLAM raised.
+        """
+        while not self._stopping:
+            self._step()
+            if slam is not None and slam.error is not None:
+                raise slam.error
+            if (
+                until_agreed is not None
+                and (slam is None or slam.over)
+                and self._quiet(until_agreed)
+            ):
+                return
+
+    def _step(self) -> None:
+        work = self.inbox.take(self._next_tick - time.monotonic())
+        events = [event for cycle in work.cycles for event in self._observe(cycle)]
+        for data in work.messages:
+            events += self.agent.receive(data, self.now)
+        if time.monotonic() >= self._next_tick:
+            events += self.agent.tick(self.now)
+            self._next_tick = time.monotonic() + TICK
+        self._keep(events)
+        out = self.agent.outbox()
+        self.network.send(out)
+        if any(_is_news(data) for data in (*work.messages, *(each.data for each in out))):
+            self._last_news = self.now
+        self._note(events)
+        for question in work.questions:
+            self._answer(question)
+
+    def _observe(self, cycle: Cycle) -> list[Event]:
+        started, before = time.perf_counter(), self.agent.observing.observed
+        try:
+            events = self.agent.observe(cycle, self.now)
+        except CycleError as error:  # one bad cycle of a SLAM is no reason to stop mapping
+            self._log.seldom("warning", "cycle refused", "cycle", reason=error)
+            return []
+        took = time.perf_counter() - started
+        self.counts.cycles += 1
+        self.counts.points += self.agent.observing.observed - before
+        self.counts.observe_s += took
+        self.counts.observe_max_s = max(self.counts.observe_max_s, took)
+        return events
+
+    def _keep(self, events: list[Event]) -> None:
+        """A transaction is on the disk before anyone is told of it; one commit for the step."""
+        accepted = [(event.id, event.data) for event in events if isinstance(event, Accepted)]
+        if accepted:
+            self._store.append_many(accepted)
+            self.counts.stored += len(accepted)
+
+    def _note(self, events: list[Event]) -> None:
+        """Count, and say what a person should know."""
+        for event in events:
+            if isinstance(event, Issued):
+                self.counts.issued += 1
+                self.counts.features += event.features
+            elif isinstance(event, Rejected):
+                self._note_refusal(event)
+            elif isinstance(event, Forked):
+                mine = event.author == self.agent.identity.author
+                self._log.write(
+                    "error" if mine else "warning",
+                    "own key was used twice" if mine else "fork proven",
+                    author=event.author.hex(),
+                    sequence=event.sequence,
+                    consequence="this robot issues nothing more; give it a new data folder"
+                    if mine
+                    else "nothing of this author from there on counts",
+                )
+        if time.monotonic() >= self._next_state:
+            self._next_state = time.monotonic() + _STATE_PERIOD
+            self._log.write("info", "state", **self._state())
+
+    def _note_refusal(self, event: Rejected) -> None:
+        self.counts.refused[event.reason] += 1
+        whose = "unknown" if event.fault is None else event.fault.hex()
+        remedy = {}
+        if event.reason is Reason.PARAMETERS:
+            remedy["remedy"] = (
+                "that robot computes another map; make [fold], [transaction], graph.n_p and "
+                "graph.n_c_max equal on all robots of the fleet"
+            )
+        self._log.seldom(
+            "warning",
+            "refused",
+            event.reason.name,
+            reason=event.reason.value,
+            detail=event.detail or "none",
+            whose=whose,
+            **remedy,
+        )
+
+    def _state(self) -> dict[str, object]:
+        """What the line of the log says."""
+        return {
+            "cycles": self.counts.cycles,
+            "transactions": len(self.agent.ledger),
+            "issued": self.counts.issued,
+            "waiting": len(self.agent.ledger.missing()),
+            "robots": len(self.network.here),
+            "unsent_bytes": self.network.waiting_bytes,
+            "refused": self.counts.refused.total(),
+        }
+
+    def _quiet(self, seconds: float) -> bool:
+        """Whether all is said here, and the others were heard since the last news."""
+        if self.agent.holds_back or self.network.waiting_bytes:
+            return False
+        peers, last = self.agent.sync.peers, self._last_news
+        heard = all(who in peers and peers[who].heard > last for who in self.network.here)
+        return heard and self.now - last >= seconds
+
+    def _answer(self, question: Question) -> None:
+        question.answer = self._report(self)
+        question.answered.set()
+
+
+def _is_news(data: bytes) -> bool:
+    """Whether a message tells or asks for transactions."""
+    return kind_of(data) in (Kind.TRANSACTIONS, Kind.WANT)

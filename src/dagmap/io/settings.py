@@ -1,0 +1,143 @@
+"""What one robot's process is told: the parameters of `Config` and the tables of its surroundings.
+
+Relative paths in the file are meant from the folder that the file is in.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from ..config import Config, _Checked, load_config
+from ..model import ConfigError
+
+
+class SourceConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The recording that stands in for a SLAM. Without this table the robot only listens."""
+
+    path: str  # a TUM RGB-D folder or a cycle stream .npz
+    max_features: int = 1000  # points that a frame of pictures gives at most
+    camera: str | None = None  # a camera.json to use instead of the recording's own
+
+
+class TlsConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """PEM files. Both ends show a certificate of the authority, or there is no connection."""
+
+    ca: str
+    certificate: str
+    key: str
+
+
+class NetworkConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How the robots reach each other, and what is kept for them at most."""
+
+    mode: Literal["peer", "router", "client"] = "peer"  # a router relays between its clients
+    listen: tuple[str, ...] = ()  # endpoints such as "tcp/0.0.0.0:7447"; none: any free port
+    connect: tuple[str, ...] = ()  # endpoints of other robots, tried again and again
+    scouting: bool = True  # look for robots by multicast
+    gossip: bool = True  # let robots in reach tell of further ones
+    tls: TlsConfig | None = None
+    send_bytes: int = 16 << 20  # waiting to be sent: a link that stalls for long costs no more
+    receive_bytes: int = 32 << 20  # received and not looked at yet, from all robots
+    receive_bytes_per_robot: int = 8 << 20  # of that, from one: none crowds out the others
+
+    def __post_init__(self) -> None:
+        for name in ("send_bytes", "receive_bytes", "receive_bytes_per_robot"):
+            self._require_range(name, 1 << 16, 1 << 32)
+        self._require(
+            self.mode != "client" or bool(self.connect) or self.scouting,
+            "mode",
+            "a client wants a router in `connect`, or scouting",
+        )
+        self._require(
+            self.mode != "router" or bool(self.listen),
+            "listen",
+            'a router wants an endpoint that others can name, such as "tcp/0.0.0.0:7447"',
+        )
+        for name in ("listen", "connect"):
+            ends: tuple[str, ...] = getattr(self, name)
+            named = all("/" in end.strip("/") for end in ends)
+            self._require(named, name, 'endpoints such as "tcp/192.168.1.7:7447" are wanted')
+            secure = self.tls is None or all(end.startswith("tls/") for end in ends)
+            self._require(secure, name, "with [network.tls] every endpoint begins with tls/")
+
+
+class StoreConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where the ledger is. Its folder is the robot's data folder, made where it is missing."""
+
+    path: str
+
+
+class MetricsConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Numbers for Prometheus under http://LISTEN/metrics; off unless an address is given."""
+
+    listen: str | None = None  # "127.0.0.1:9464"; anybody who reaches the address can read it
+
+    def __post_init__(self) -> None:
+        if self.listen is not None:
+            host, _, port = self.listen.rpartition(":")
+            right = bool(host) and port.isdecimal() and int(port) < 1 << 16
+            self._require(right, "listen", 'an address such as "127.0.0.1:9464" is wanted')
+
+    @property
+    def address(self) -> tuple[str, int] | None:
+        if self.listen is None:
+            return None
+        host, _, port = self.listen.rpartition(":")
+        return host.strip("[]"), int(port)
+
+
+class ControlConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The socket that `dagmap status` asks, for this user only."""
+
+    path: str | None = None  # default: status.sock beside the ledger
+
+
+class AgentConfig(Config, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A configuration file of `dagmap agent`: the keys of `Config`, and these tables."""
+
+    store: StoreConfig
+    source: SourceConfig | None = None
+    network: NetworkConfig = NetworkConfig()
+    metrics: MetricsConfig = MetricsConfig()
+    control: ControlConfig = ControlConfig()
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """A configuration file and the folder that its paths are meant from."""
+
+    config: AgentConfig
+    folder: Path
+
+    def at(self, path: str) -> Path:
+        """A path of the file as one that can be opened."""
+        return Path(os.path.normpath(self.folder / Path(path).expanduser()))
+
+    @property
+    def ledger(self) -> Path:
+        return self.at(self.config.store.path)
+
+    @property
+    def control(self) -> Path:
+        """Of the socket that answers `dagmap status`."""
+        path = self.config.control.path
+        return self.ledger.parent / "status.sock" if path is None else self.at(path)
+
+
+def load_settings(path: Path) -> Settings:
+    """Read a configuration file. A robot without a name is called like its file.
+
+    Raises ConfigError that names the file, the key and what is wanted.
+    """
+    config = load_config(path, AgentConfig)
+    if not config.name:
+        try:
+            config = msgspec.structs.replace(config, name=path.stem)
+        except ConfigError as error:
+            raise ConfigError(f"{path}: {error}; give the robot a `name`") from None
+    return Settings(config, path.parent)

@@ -1,0 +1,116 @@
+"""The queues around the agent: bounded, and never in the way of the SLAM."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+
+from dagmap import Config, Cycle
+from dagmap.io.queues import Inbox, Question, SendQueue
+from dagmap.messages import Heads, Transactions, encode
+from dagmap.model import Outgoing
+
+ME, YOU = b"me......", b"you....."
+
+
+def message(size: int, sender: bytes = ME) -> bytes:
+    return encode(Transactions((bytes(size - 36),)), Config(), sender)
+
+
+def heads(token: int) -> bytes:
+    return encode(Heads(token, (), ()), Config(), ME)
+
+
+def cycle(stamp: float) -> Cycle:
+    return Cycle(stamp, np.eye(4), np.zeros((0, 3)))
+
+
+class TestInbox:
+    def test_messages_come_out_in_order_and_a_few_at_a_time(self) -> None:
+        inbox = Inbox(1 << 20, 1 << 20)
+        sent = [message(100 + i) for i in range(2 * Inbox.MESSAGES)]
+        assert all(inbox.put_message(data) for data in sent)
+        assert inbox.take(0).messages == sent[: Inbox.MESSAGES]
+        assert inbox.take(0).messages == sent[Inbox.MESSAGES :]
+        assert inbox.take(0).messages == []
+
+    def test_one_sender_cannot_crowd_out_another(self) -> None:
+        inbox = Inbox(10_000, 4_000)
+        taken = [inbox.put_message(message(1_000, YOU)) for _ in range(6)]
+        assert taken == [True] * 4 + [False] * 2
+        assert inbox.put_message(message(1_000, ME))
+        assert inbox.dropped == 2
+
+    def test_all_senders_together_are_bounded(self) -> None:
+        inbox = Inbox(10_000, 4_000)
+        taken = [inbox.put_message(message(1_000, bytes([i]) * 8)) for i in range(12)]
+        assert sum(taken) == 10 and inbox.dropped == 2
+        assert len(inbox.take(0).messages) == 10
+        assert inbox.put_message(message(1_000))  # what was taken has made room
+
+    def test_a_message_too_short_to_name_its_sender(self) -> None:
+        inbox = Inbox(1_000, 1_000)
+        assert inbox.put_message(b"")
+        assert inbox.put_message(b"DM")
+        assert inbox.take(0).messages == [b"", b"DM"]
+
+    def test_a_cycle_waits_for_the_one_before_to_be_taken(self) -> None:
+        inbox = Inbox(1_000, 1_000)
+        second = threading.Thread(target=lambda: inbox.put_cycle(cycle(2.0)))
+        assert inbox.put_cycle(cycle(1.0))
+        second.start()
+        assert [each.stamp for each in inbox.take(0).cycles] == [1.0]
+        second.join(10)
+        assert [each.stamp for each in inbox.take(0).cycles] == [2.0]
+
+    def test_closing_lets_go_of_the_slam(self) -> None:
+        inbox, result = Inbox(1_000, 1_000), []
+        assert inbox.put_cycle(cycle(1.0))
+        slam = threading.Thread(target=lambda: result.append(inbox.put_cycle(cycle(2.0))))
+        slam.start()
+        inbox.close()
+        slam.join(10)
+        assert result == [False]
+
+    def test_taking_waits_for_something(self) -> None:
+        inbox, question = Inbox(1_000, 1_000), Question()
+        asker = threading.Timer(0.05, inbox.put_question, [question])
+        asker.start()
+        assert inbox.take(30).questions == [question]
+        asker.join()
+
+
+class TestSendQueue:
+    def test_in_order_then_closed(self) -> None:
+        queue = SendQueue(1 << 20)
+        sent = [Outgoing(message(100)), Outgoing(heads(1), YOU)]
+        queue.put(sent)
+        queue.close()
+        assert [queue.take(), queue.take(), queue.take()] == [*sent, None]
+        assert queue.size == 0
+
+    def test_announcements_leave_before_transactions_the_oldest_first(self) -> None:
+        queue = SendQueue(3_000)
+        old, new = Outgoing(heads(1)), Outgoing(heads(2))
+        transactions = [Outgoing(message(980)) for _ in range(3)]
+        queue.put([transactions[0], old, transactions[1], new])
+        queue.put([transactions[2]])  # 2,940 bytes and one announcement fit
+        queue.close()
+        left = [queue.take() for _ in range(5)]
+        assert left == [transactions[0], transactions[1], new, transactions[2], None]
+        assert queue.dropped == 1
+
+    def test_without_announcements_the_oldest_leaves(self) -> None:
+        queue = SendQueue(2_000)
+        transactions = [Outgoing(message(800 + i)) for i in range(5)]
+        queue.put(transactions)
+        assert queue.dropped == 3 and queue.size <= 2_000
+        assert [queue.take(), queue.take()] == transactions[3:]
+
+    def test_taking_waits_for_something(self) -> None:
+        queue, out = SendQueue(1_000), Outgoing(heads(1))
+        sender = threading.Timer(0.05, queue.put, [[out]])
+        sender.start()
+        assert queue.take() == out
+        sender.join()
