@@ -90,10 +90,7 @@ def measure(walk: Walk, name: str, seeds: int, methods: list[str]) -> list[dict[
     truth, found = Truth.of(walk), {method: {} for method in methods}
     for seed in range(seeds):
         changed = CONDITIONS[name](walk, np.random.default_rng(seed))
-        # who rotates does not see what the recording saw: it can only keep what there was
-        union = (
-            thin(_static(changed)) if name in ("people", "20 %, one robot only rotates") else None
-        )
+        union = thin(_static(changed)) if name in OTHER_VIEWS else truth.union
         for method in methods:
             started = time.process_time()
             for parameters, points in METHODS[method](changed):

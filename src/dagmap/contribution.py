@@ -150,6 +150,7 @@ class Contribution:
             cores=self.cores,
             sightings=np.concatenate([np.zeros(0, np.int64), *numbers]),
             sighting_cycle=np.concatenate([np.zeros(0, np.int32), *cycles]),
+            origin=np.repeat(part.origins, sizes, axis=0),
         )
 
     def alive(self, part: Part) -> Bools:
