@@ -36,7 +36,7 @@ class GraphConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     n_p: int = 2  # N_p, parents of a node at most
     n_c: int = 2  # N_c, children at which a node leaves the terminals; the start value
     n_c_max: int = 8  # the bound within which the controller moves N_c
-    v_th: int = 3  # V_th: a node whose validity exceeds it becomes the core of a bundle
+    v_th: int = 1  # V_th: a node whose validity exceeds it becomes the core of a bundle
     reference_pitch: float = 0.05  # m, of the lattice of reference nodes
     max_parent_distance: float | None = 0.15  # m; None: parents may be any distance away
     issued_validity: Literal["inherit", "reset"] = "inherit"
@@ -97,10 +97,11 @@ class FoldConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True
     """Section 4.3: the map consensus. All of it is fleet-wide."""
 
     preset: Literal["default", "paper"] = "default"
-    delta: float = 0.05  # m: observations within it are twins (Algorithm 2's delta)
+    delta: float = 0.03  # m: observations within it are twins (Algorithm 2's delta)
     witnesses: int = 2  # authors that a confirmed node needs
-    hit_say: int = 2  # what one author's hits count for in one node, at most
+    hit_say: int = 1  # what one author's hits count for in one node, at most
     miss_say: int = 1  # what one author's misses count for in one node, at most
+    doubt: int = 36  # what speaks for a node must outweigh it, or misses count; see `weighing`
     cell: float = 0.10  # m: cell of the ray evidence
     max_ray: float = 5.0  # m: a ray is walked so far from its sensor
 
@@ -109,6 +110,7 @@ class FoldConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True
         self._require_range("witnesses", 1, 1000)
         self._require_range("hit_say", 1, 1000)
         self._require_range("miss_say", 0, 1000)
+        self._require_range("doubt", 0, 1000)
         self._require_range("cell", 0.005, 10.0)
         self._require_range("max_ray", 0.0, 100.0)
         self._require(
@@ -118,6 +120,11 @@ class FoldConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True
     @property
     def delta_mm(self) -> int:
         return round(self.delta * 1000)
+
+    @property
+    def support_mm(self) -> int:
+        """What lies so near to a node supports it, mm: two and a half delta."""
+        return 5 * self.delta_mm // 2
 
     @property
     def cell_mm(self) -> int:
