@@ -6,9 +6,10 @@ socket, disk, chance or log in here or below.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
+from . import checkpoint as checkpoints
 from . import messages
 from .config import Config
 from .consensus import Consensus
@@ -28,6 +29,7 @@ from .model import (
     MapChanged,
     Outgoing,
     Rejected,
+    TransactionId,
     Waiting,
     pose_matrix,
     quantise_cycle,
@@ -73,18 +75,27 @@ class Agent:
         config: Config | None,
         transactions: Iterable[bytes],
         parsers: Parsers | None = None,
+        checkpoint: bytes | None = None,
     ) -> Agent:
         """An agent that holds these transactions (as `Accepted` gave them) and goes on.
 
         Its adjacency DAG and the ids of the SLAM are those of a new start: where the SLAM was
         started anew too, give its cycles a new session.
+        checkpoint: what `checkpoint` gave for the first of them; not used where it does not match.
         """
         agent = cls(identity, config, parsers)
+        if checkpoint is not None:
+            transactions = agent._thaw(checkpoint, {id_of(data): data for data in transactions})
         for data in transactions:
             agent._through_the_door(data, again=True)
         agent.observing.resume(agent.ledger.chain(identity.author).main)
         agent._outbox.clear()
         return agent
+
+    def checkpoint(self, stored: Sequence[TransactionId]) -> bytes:
+        """The folded state. stored: ids of all accepted transactions, in the order of the store."""
+        self._advance()
+        return checkpoints.save(self.ledger, self.consensus, self.identity, stored)
 
     def observe(self, cycle: Cycle, now: float) -> list[Event]:
         """Take one cycle of the local SLAM. Raises CycleError, and then nothing was taken."""
@@ -170,6 +181,16 @@ class Agent:
     @property
     def _frame(self) -> tuple[AuthorId, int]:
         return self.identity.author, self.observing.session
+
+    def _thaw(self, checkpoint: bytes, stored: dict[TransactionId, bytes]) -> list[bytes]:
+        """Take over the state of a checkpoint. Returns the transactions that it lacks."""
+        found = checkpoints.load(checkpoint, self.identity, self.config, stored)
+        if found is None:
+            return list(stored.values())
+        self.ledger, self.consensus, held = found
+        self.sync = Sync(self.ledger, self.config, self.identity.author)
+        self.ledger.changed.update(self.ledger.chains)  # nobody has read them in this process
+        return list(stored.values())[held:]
 
     def _issue(self, now: float) -> list[Event]:
         """Section 4.2: seal what is valid and may go out, and take it through the door."""

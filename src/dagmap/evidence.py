@@ -6,7 +6,7 @@ Sums commute, so this stays outside the fold's undo: what is withdrawn or moved 
 from __future__ import annotations
 
 import hashlib
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -70,6 +70,19 @@ class RayEvidence:
             wide=np.zeros((0, 64), np.int32),
         )
         self._marks = _marks(64, 1024, np.concatenate([np.zeros(rays.KEY, np.int64), key]))
+
+    def __getstate__(self) -> dict[str, object]:
+        """For a checkpoint: without the marks of a call, and without the second view of `small`."""
+        bricks_ = self._bricks._replace(word=np.zeros((0, 0), np.int32))
+        return vars(self) | {"_bricks": bricks_, "_marks": self._marks.top}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        held = state["_bricks"]
+        restored = {
+            "_bricks": held._replace(word=held.small.view(np.int32)),
+            "_marks": _marks(64, 1024, state["_marks"]),
+        }
+        vars(self).update(state | restored)
 
     def __len__(self) -> int:
         return int(self._bricks.top[bricks.LIVE])

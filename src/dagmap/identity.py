@@ -22,6 +22,7 @@ class Identity:
         self.author = author_of(self.public_key)
         salt = hashlib.blake2b(seed, digest_size=8, person=b"dagmap salt").digest()
         self.salt = int.from_bytes(salt, "little") >> 2  # keeps hash tables unguessable to others
+        self._secret = hashlib.blake2b(seed, digest_size=32, person=b"dagmap secret").digest()
 
     @classmethod
     def from_seed(cls, seed: bytes) -> Identity:
@@ -33,6 +34,10 @@ class Identity:
     def sign(self, message: bytes) -> bytes:
         """64 bytes of Ed25519 signature."""
         return self._key.sign(message)
+
+    def secret(self, purpose: bytes) -> bytes:
+        """32 bytes that only this robot knows, others for every purpose."""
+        return hashlib.blake2b(purpose, digest_size=32, key=self._secret).digest()
 
     def __repr__(self) -> str:
         return f"Identity({self.author.hex()})"

@@ -59,7 +59,7 @@ class Ledger:
     """The transactions that a robot holds. `add` is the only way in."""
 
     def __init__(self, config: Config) -> None:
-        self._config = config
+        self.config = config
         self.chains: dict[AuthorId, Chain] = {}
         self.changed: set[AuthorId] = set()  # whose chain did, since its reader cleared this
         self._known: dict[TransactionId, Transaction] = {}
@@ -81,6 +81,12 @@ class Ledger:
     def __iter__(self) -> Iterator[Transaction]:
         """All accepted transactions, each after everything that it refers to."""
         return iter(self._known.values())
+
+    def all(self) -> Iterator[Transaction]:
+        """Everything that is held: accepted, waiting, and proofs of forks."""
+        yield from self._known.values()
+        yield from (tx for tx, _ in self._waiting.values())
+        yield from (tx for chain in self.chains.values() for tx in chain.proof or ())
 
     def sizes(self) -> Sizes:
         return Sizes(len(self._known), len(self._waiting), self._waiting_size)
@@ -226,7 +232,7 @@ class Ledger:
             chain.children = grown
         numbers, counts = np.unique(bundle.parents[bundle.parents >= 0], return_counts=True)
         total = chain.children[numbers] + counts
-        if (total > self._config.graph.n_c_max).any():
+        if (total > self.config.graph.n_c_max).any():
             return False
         chain.children[numbers] = total
         return True
@@ -255,7 +261,7 @@ class Ledger:
         self._waiting_size += len(tx.data)
         for id_ in missing:
             self._waited_for.setdefault(id_, []).append(tx.id)
-        limits = self._config.ledger
+        limits = self.config.ledger
         while (
             len(self._waiting) > limits.waiting_transactions
             or self._waiting_size > limits.waiting_bytes

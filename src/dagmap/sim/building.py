@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..config import _Checked
-from ..model import Floats, Int64s
+from ..model import Bools, Floats, Int64s
 
 DOOR_HEIGHT = 2.0  # m
 BOXES = 16  # places for boxes in a room: 2 x 2 in each corner, off the ways from door to door
@@ -73,49 +73,56 @@ class Building:
         cells = np.clip(cells, 0, (x - 1, y - 1)).astype(np.int64)
         return np.asarray(cells[:, 0] * y + cells[:, 1], np.int64)
 
-    def cell_of(self, point: Floats) -> int:
-        """The cell in which a point of free space lies."""
-        room = int(self.room_of(point[None])[0])
+    def cells_of(self, points: Floats) -> Int64s:
+        """(N,) cells in which points (N, 3) of free space lie."""
+        rooms = self.room_of(points)
+        cells = rooms.copy()
         for side in range(4):
-            out = point[side // 2] - (self.high if side % 2 else self.low)[room, side // 2]
-            if (out > 0) == (side % 2 == 1) and out != 0 and self._gates[room, side] >= 0:
-                return int(self._gates[room, side])
-        return room
+            axis, bounds = side // 2, self.high if side % 2 else self.low
+            out = (points[:, axis] - bounds[rooms, axis]) * (1 if side % 2 else -1) > 0
+            gates = self._gates[rooms, side]
+            cells = np.where(out & (gates >= 0), gates, cells)
+        return cells
 
-    def cast(self, origin: Floats, directions: Floats, limit: float) -> tuple[Floats, Int64s]:
-        """Where rays end: (N,) m, inf beyond `limit`; (N,) numbers of the surfaces they end on.
+    def cast(self, origins: Floats, directions: Floats, limit: float) -> tuple[Floats, Int64s]:
+        """Where rays end: (N, R) m, inf beyond `limit`; (N, R) numbers of the surfaces they hit.
 
-        origin: (3,) in free space. directions: (N, 3) of length 1.
+        origins: (N, 3) in free space. directions: (N, R, 3) of length 1, R rays from each.
         """
-        directions = np.where(np.abs(directions) < _TINY, _TINY, directions)
-        inverse, ahead = 1.0 / directions, directions > 0
+        each = directions.shape[1]
+        directions = directions.reshape(-1, 3)
+        inverses = inverse(directions)
+        ahead = inverses > 0
+        origin = np.repeat(origins, each, axis=0)
         depth = np.full(len(directions), np.inf)
         surface = np.full(len(directions), -1, np.int64)
-        rows = np.arange(len(directions))
-        cell = np.full(len(directions), self.cell_of(origin))
+        rows, cell = np.arange(len(directions)), np.repeat(self.cells_of(origins), each)
         while len(rows):
-            d, inv, up = directions[rows], inverse[rows], ahead[rows]
-            way = (np.where(up, self.high[cell], self.low[cell]) - origin) * inv
-            index = np.arange(len(rows))
-            axis = way.argmin(axis=1)
+            at, inv, up = origin[rows], inverses[rows], ahead[rows]
+            way = (np.where(up, self.high[cell], self.low[cell]) - at) * inv
+            index, axis = np.arange(len(rows)), way.argmin(axis=1)
             end, side = way[index, axis], 2 * axis + up[index, axis]
             gate = self._gates[cell, side]
-            point = origin + d * end[:, None]
-            inside = (self.low[gate] <= point) & (point <= self.high[gate])
-            inside[index, axis] = True  # on the face itself
-            on = inside.all(axis=1) & (gate >= 0)
-            if cell[0] < self.rooms and self.config.objects:  # rays are all in rooms, or in none
-                reach, number = enter(origin, inv, self._box_low[cell], self._box_high[cell])
+            on = gate >= 0
+            point = at[on] + directions[rows[on]] * end[on, None]
+            on[on] = self._through(gate[on], point, axis[on])
+            if self.config.objects:
+                reach, number = enter(at, inv, self._box_low[cell], self._box_high[cell])
                 nearer = reach < end
-                end = np.where(nearer, reach, end)
-                side = np.where(nearer, 6 + number, side)
+                end, side = np.where(nearer, reach, end), np.where(nearer, 6 + number, side)
                 on &= ~nearer
             done = ~on & (end <= limit)
             depth[rows[done]] = end[done]
             surface[rows[done]] = cell[done] * (6 + BOXES) + side[done]
             on &= end < limit
             rows, cell = rows[on], gate[on]
-        return depth, surface
+        return depth.reshape(-1, each), surface.reshape(-1, each)
+
+    def _through(self, gate: Int64s, points: Floats, axis: Int64s) -> Bools:
+        """(N,) whether points (N, 3) on the faces across `axis` lie where the next cell begins."""
+        inside = (self.low[gate] <= points) & (points <= self.high[gate])
+        inside[np.arange(len(gate)), axis] = True  # up to rounding
+        return np.asarray(inside.all(axis=1))
 
     def distance(self, points: npt.ArrayLike) -> Floats:
         """(N,) m from (N, 3) points anywhere to the nearest static surface, exactly.
@@ -126,8 +133,10 @@ class Building:
         out = np.empty(len(points))
         rooms = self.room_of(points)
         order = np.argsort(rooms, kind="stable")
-        names, starts = np.unique(rooms[order], return_index=True)
-        for room, rows in zip(names.tolist(), np.split(order, starts[1:]), strict=True):
+        names, counts = np.unique(rooms, return_counts=True)
+        ends = np.cumsum(counts)
+        for room, end, count in zip(names.tolist(), ends, counts, strict=True):
+            rows = order[end - count : end]
             cells = [room, *(gate for gate in self._gates[room].tolist() if gate >= 0)]
             faces = np.concatenate([self.faces(cell) for cell in cells])
             for i in range(0, len(rows), _ROWS):
@@ -175,6 +184,7 @@ class Building:
     def _put_boxes(self, rng: np.random.Generator) -> None:
         """Boxes on the floor, in the corners of rooms: each in a place of its own."""
         config, shape = self.config, (self.rooms, self.config.objects)
+        everywhere = (len(self.low), config.objects, 3)
         free = config.door / 2 + 0.2  # m to both sides of the way from door to door
         edge = (config.room / 2 - config.wall / 2 - free) / 2
         starts = np.array([-free - 2 * edge, -free - edge, free, free + edge])
@@ -184,11 +194,13 @@ class Building:
         size = rng.uniform(0.4, 0.9, (*shape, 2)) * edge
         room_left = edge - size
         corner = centres + np.stack([starts[chosen // 4], starts[chosen % 4]], axis=-1)
-        self._box_low = np.zeros((*shape, 3))
-        self._box_high = np.empty((*shape, 3))
-        self._box_low[..., :2] = corner + room_left * rng.uniform(0.1, 0.9, (*shape, 2))
-        self._box_high[..., :2] = self._box_low[..., :2] + size
-        self._box_high[..., 2] = rng.uniform(0.3, 1.9, shape)
+        corner = corner + room_left * rng.uniform(0.1, 0.9, (*shape, 2))
+        self._box_low = np.full(everywhere, np.inf)  # none in doorways: boxes out of reach
+        self._box_high = np.full(everywhere, np.inf)
+        rooms = slice(self.rooms)
+        self._box_low[rooms, :, :2], self._box_low[rooms, :, 2] = corner, 0.0
+        self._box_high[rooms, :, :2] = corner + size
+        self._box_high[rooms, :, 2] = rng.uniform(0.3, 1.9, shape)
 
     def _rectangles(self, cell: int) -> Floats:
         out = []
@@ -206,14 +218,24 @@ class Building:
         return np.array(out)
 
 
+def inverse(directions: Floats) -> Floats:
+    """1 / direction, finite: what runs along an axis deviates by next to nothing."""
+    return np.asarray(1.0 / np.where(np.abs(directions) < _TINY, _TINY, directions))
+
+
 def enter(origin: Floats, inverse: Floats, low: Floats, high: Floats) -> tuple[Floats, Int64s]:
     """Where (N,) rays enter the first of their boxes, m (inf: none), and which box that is.
 
-    inverse: (N, 3), 1 / direction. low, high: (N or 1, K, 3). Boxes around `origin` do not count.
+    origin: (N, 3). inverse: (N, 3), 1 / direction. low, high: (N, K, 3). A box around the origin
+    does not count.
     """
-    one, two = (low - origin) * inverse[:, None], (high - origin) * inverse[:, None]
-    entry, leave = np.minimum(one, two).max(axis=2), np.maximum(one, two).min(axis=2)
-    entry = np.where((entry <= leave) & (entry > 0), entry, np.inf)
+    entry, leave = np.zeros(low.shape[:2]), np.full(low.shape[:2], np.inf)
+    for axis in range(3):  # column by column: numpy is slow at the maximum of three
+        at, inv = origin[:, axis, None], inverse[:, axis, None]
+        one, two = (low[..., axis] - at) * inv, (high[..., axis] - at) * inv
+        np.maximum(entry, np.minimum(one, two), out=entry)
+        np.minimum(leave, np.maximum(one, two), out=leave)
+    entry[(entry > leave) | (entry == 0)] = np.inf
     number = entry.argmin(axis=1)
     return entry[np.arange(len(entry)), number], number
 

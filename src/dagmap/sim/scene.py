@@ -13,25 +13,26 @@ there are, nor who is asked first.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from ..model import Bools, Cycle, Floats, Int64s
-from .building import Building, SceneConfig, enter
-from .sensor import Sensor, SensorConfig, displace
-from .walk import MotionConfig, Odometry, Route, matrices
+from .building import Building, SceneConfig, enter, inverse
+from .looking import PERSON, Ids, Looking, Pose, View
+from .odometry import Odometry, pose_matrix
+from .sensor import SensorConfig
+from .walk import MotionConfig, Route
 
 __all__ = ["MotionConfig", "Scene", "SceneConfig", "Seen", "SensorConfig", "Walker"]
 
-PERSON = (0.5, 1.75)  # m, width and height
+PERSON_SIZE = (0.5, 1.75)  # m, width and height
 PEOPLE_SPEED = 1.1  # m/s
 FOUND_WRONG = 0.7  # share of bad points that a SLAM withdraws when it closes a loop
-_PERSON_SURFACE = -1
-_BUILDING, _SENSOR, _COLORS = range(3)  # what chance is drawn for
+_TIMES = 64  # at which it is remembered where people stand
+_BUILDING, _SENSOR, _SLAM, _COLORS = range(4)  # what chance is drawn for
 
 
 class Seen(NamedTuple):
@@ -40,7 +41,7 @@ class Seen(NamedTuple):
     points: Floats  # (N, 3) m in the fleet frame, where it truly is: no noise, drift or outlier
     stamps: Floats  # (N,) s
     sessions: Int64s  # (N,)
-    ids: npt.NDArray[np.uint64]  # (N,)
+    ids: Ids  # (N,)
     outliers: Bools  # (N,) handed in far from where it is
     people: Bools  # (N,) on a person
 
@@ -80,7 +81,7 @@ class Scene:
             Route(self.building, room, PEOPLE_SPEED, f"{seed} person {number}")
             for number, room in enumerate(rooms)
         ]
-        self._people_at: tuple[float, Floats] = math.nan, np.zeros((0, 2))
+        self._people_at: dict[float, list[tuple[float, float]]] = {}
         self._walkers: dict[int, Walker] = {}
 
     def chance(self, *purpose: int) -> np.random.Generator:
@@ -104,29 +105,36 @@ class Scene:
         """(M, 3) m in the fleet frame: a grid of that pitch (m) on all static surfaces."""
         return self.building.truth(spacing)
 
-    def people(self, t: float) -> Floats:
-        """(P, 2) m where people stand at a time in s."""
-        if t != self._people_at[0]:
-            places = np.array([person.position(t) for person in self._people]).reshape(-1, 2)
-            self._people_at = t, places
-        return self._people_at[1]
+    def people(self, t: float) -> list[tuple[float, float]]:
+        """Where people stand at a time in s, (x, y) m each."""
+        if t not in self._people_at:
+            if len(self._people_at) >= _TIMES:
+                self._people_at.clear()  # robots look at the same times
+            self._people_at[t] = [person.position(t) for person in self._people]
+        return self._people_at[t]
 
-    def cast(self, origin: Floats, directions: Floats, t: float) -> tuple[Floats, Int64s]:
-        """As `Building.cast` up to the sensor's range, with people (surface -1) in the way."""
-        depth, surface = self.building.cast(origin, directions, self.sensor.range)
-        people = self.people(t)
-        half, height = PERSON[0] / 2, PERSON[1]
-        near = np.abs(people - origin[:2]).max(axis=1) <= self.sensor.range + half
-        if not near.any():
+    def cast(
+        self, origins: Floats, directions: Floats, times: Sequence[float]
+    ) -> tuple[Floats, Int64s]:
+        """As `Building.cast` up to the sensor's range, with people in the way at N times in s."""
+        depth, surface = self.building.cast(origins, directions, self.sensor.range)
+        if not self._people:
             return depth, surface
-        people = people[near]
-        low = np.column_stack([people - half, np.zeros(len(people))])
-        high = np.column_stack([people + half, np.full(len(people), height)])
-        with np.errstate(divide="ignore"):
-            inverse = 1.0 / directions
-        reach, _ = enter(origin, inverse, low[None], high[None])
+        people = np.array([self.people(t) for t in times])
+        half, height = PERSON_SIZE[0] / 2, PERSON_SIZE[1]
+        far = np.abs(people - origins[:, None, :2]).max(axis=2)
+        near = int((far <= self.sensor.range + half).sum(axis=1).max())
+        if not near:
+            return depth, surface
+        nearest = np.argsort(far, axis=1, kind="stable")[:, :near, None]
+        low, high = np.zeros((2, len(times), near, 3))
+        low[..., :2] = np.take_along_axis(people, nearest, axis=1) - half
+        high[..., :2], high[..., 2] = low[..., :2] + 2 * half, height
+        each = directions.shape[1]
+        origin, low, high = (np.repeat(a, each, axis=0) for a in (origins, low, high))
+        reach = enter(origin, inverse(directions.reshape(-1, 3)), low, high)[0].reshape(-1, each)
         hit = (reach < depth) & (reach <= self.sensor.range)
-        return np.where(hit, reach, depth), np.where(hit, _PERSON_SURFACE, surface)
+        return np.where(hit, reach, depth), np.where(hit, PERSON, surface)
 
 
 class Walker:
@@ -136,7 +144,7 @@ class Walker:
         self._scene, self.index = scene, index
         seed = f"{scene.seed} robot {index}"
         self._route = Route(scene.building, room, scene.motion.speed, seed)
-        self._seen = [_NOTHING]
+        self._seen: list[tuple[float, int, View]] = []
 
     def position(self, t: float) -> tuple[float, float, float]:
         """True (x, y, z) of the sensor at a time in s, m in the fleet frame."""
@@ -150,6 +158,10 @@ class Walker:
             return self._route.heading(0.0) + self._scene.motion.turn * t
         return self._route.heading(t)
 
+    def pose(self, t: float) -> Pose:
+        """True (x, y, z) in m and yaw in rad of the sensor at a time in s, in the fleet frame."""
+        return (*self.position(t), self.heading(t))
+
     def cycles(self, until: float, start: float = 0.0, session: int = 0) -> Iterator[Cycle]:
         """The cycles of a SLAM that starts at `start`: one every period, before `until` (s).
 
@@ -159,31 +171,28 @@ class Walker:
         """
         run = _Run(self._scene, self, session)
         period = self._scene.sensor.period
-        for number in range(max(0, math.ceil((until - start) / period))):
-            cycle, seen = run.cycle(start + number * period)
-            self._seen.append(seen)
-            yield cycle
+        count = max(0, math.ceil((until - start) / period))
+        for first in range(0, count, run.batch):
+            numbers = range(first, min(first + run.batch, count))
+            for cycle, view in run.cycles([start + number * period for number in numbers]):
+                self._seen.append((cycle.stamp, session, view))
+                yield cycle
 
     def seen(self) -> Seen:
         """All that was handed in by now, in that order."""
-        columns = zip(*self._seen, strict=True)
-        self._seen = [Seen(*(np.concatenate(column) for column in columns))]
-        return self._seen[0]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Look:
-    """What the sensor measured in one cycle, a row a point."""
-
-    local: Floats  # (N, 3) m in the sensor frame, as measured
-    true: Floats  # (N, 3) m in the fleet frame
-    ids: npt.NDArray[np.uint64]
-    outliers: Bools
-    surface: Int64s
-
-    @property
-    def bad(self) -> Bools:
-        return np.asarray(self.outliers | (self.surface == _PERSON_SURFACE))
+        if not self._seen:
+            return _NOTHING
+        stamps, sessions, views = zip(*self._seen, strict=True)
+        counts = [len(view.ids) for view in views]
+        view = View(*(np.concatenate(column) for column in zip(*views, strict=True)))
+        return Seen(
+            view.true,
+            np.repeat(np.array(stamps), counts),
+            np.repeat(np.array(sessions, np.int64), counts),
+            view.ids,
+            view.outliers,
+            view.surface == PERSON,
+        )
 
 
 class _Run:
@@ -191,85 +200,46 @@ class _Run:
 
     def __init__(self, scene: Scene, walker: Walker, session: int) -> None:
         self._scene, self._walker, self._session = scene, walker, session
-        self._rng = scene.chance(_SENSOR, walker.index, session)
-        self._sensor = Sensor(scene.sensor)
+        chance = scene.chance(_SENSOR, walker.index, session)
+        self._looking = Looking(scene.sensor, scene.cast, walker.pose, chance)
+        self._rng = scene.chance(_SLAM, walker.index, session)
         self._odometry = Odometry(scene.motion, self._rng)
         self._stamps: list[float] = []
-        self._ids = 0  # given so far
-        self._tracks = np.zeros((0, 3)), np.zeros(0, np.uint64)  # good points of the last cycle
-        self._doubted: list[int] = []  # ids of bad points since the last loop closure
+        self._recent: list[View] = []  # since the last loop closure
         self._palette = scene.chance(_COLORS).integers(0, 256, (64, 3), np.uint8)
+        self.batch = self._looking.batch  # cycles at a time
 
-    def cycle(self, t: float) -> tuple[Cycle, Seen]:
-        """Look, go on, correct."""
-        place, yaw = np.array(self._walker.position(t)), self._walker.heading(t)
-        look = self._look(t, place, yaw)
+    def cycles(self, times: Sequence[float]) -> Iterator[tuple[Cycle, View]]:
+        """The next cycles: `batch` of them, or fewer if they are the last."""
+        for t, view in zip(times, self._looking.views(times), strict=True):
+            yield self._cycle(t, view), view
+
+    def _cycle(self, t: float, view: View) -> Cycle:
+        """Go on to where the robot is at `t`; correct the map where a place is known again."""
         self._stamps.append(t)
-        self._odometry.step(np.array([*place, yaw]))
+        self._odometry.step(self._walker.pose(t))
         changed = self._odometry.close()
-        removed = self._withdraw() if changed else None
-        self._doubted += look.ids[look.bad].tolist()
-        self._tracks = look.true[~look.bad], look.ids[~look.bad]
-        poses = matrices(self._odometry.poses[changed.start : changed.stop])
-        cycle = Cycle(
+        moved, removed = None, None
+        if changed:
+            poses = self._odometry.poses[changed.start : changed.stop - 1]
+            stamps = np.array(self._stamps[changed.start : changed.stop - 1])
+            matrices = [pose_matrix(pose) for pose in poses.tolist()]
+            moved = stamps, np.array(matrices).reshape(-1, 4, 4)
+            removed = self._withdraw()
+        self._recent.append(view)
+        return Cycle(
             stamp=t,
-            pose=poses[-1] if changed else matrices(self._odometry.poses[-1:])[0],
-            points=look.local,
-            ids=look.ids,
-            colors=self._palette[look.surface % 64] if self._scene.sensor.colors else None,
-            moved=(np.array([self._stamps[i] for i in changed[:-1]]), poses[:-1])
-            if changed
-            else None,
+            pose=pose_matrix(self._odometry.poses[-1].tolist()),
+            points=view.local,
+            ids=view.ids,
+            colors=self._palette[view.surface % 64] if self._scene.sensor.colors else None,
+            moved=moved,
             removed=removed,
             session=self._session,
         )
-        person = look.surface == _PERSON_SURFACE
-        shape = len(person)
-        sessions = np.full(shape, self._session, np.int64)
-        seen = Seen(look.true, np.full(shape, t), sessions, look.ids, look.outliers, person)
-        return cycle, seen
 
-    def _look(self, t: float, place: Floats, yaw: float) -> _Look:
-        """Points that the SLAM tracks and new ones, up to the number per cycle."""
-        config, rng, sensor = self._scene.sensor, self._rng, self._sensor
-        turn = matrices(np.array([[0.0, 0.0, 0.0, yaw]]))[0, :3, :3]
-        tracks, track_ids = self._tracked((self._tracks[0] - place) @ turn)
-        length = np.sqrt((tracks * tracks).sum(axis=1))
-        rays = np.concatenate([tracks / length[:, None], sensor.rays(rng, config.points)])
-        depth, surface = self._scene.cast(place, rays @ turn.T, t)
-        hit = np.isfinite(depth)
-        hit[: len(tracks)] &= np.abs(depth[: len(tracks)] - length) < 1e-6  # nothing in the way
-        rows = np.flatnonzero(hit)[: config.points]
-        measured, kept = sensor.measure(rng, rays[rows], depth[rows], self._baseline(t))
-        rows, measured = rows[kept], measured[kept]
-        old = int(np.count_nonzero(rows < len(tracks)))
-        factor, outliers = displace(rng, len(rows), config.outliers)
-        factor[:old], outliers[:old] = 1.0, False
-        fresh = np.arange(self._ids, self._ids + len(rows) - old, dtype=np.uint64)
-        self._ids += len(fresh)
-        return _Look(
-            local=rays[rows] * (measured * factor)[:, None],
-            true=place + (rays[rows] * depth[rows, None]) @ turn.T,
-            ids=np.concatenate([track_ids[rows[:old]], fresh]),
-            outliers=outliers,
-            surface=surface[rows],
-        )
-
-    def _tracked(self, local: Floats) -> tuple[Floats, npt.NDArray[np.uint64]]:
-        """Which of the last cycle's points (N, 3), in the sensor frame now, are looked for."""
-        room = int(self._scene.sensor.tracked * self._scene.sensor.points)
-        view = np.flatnonzero(self._sensor.in_view(local))
-        view = self._rng.permutation(view)[:room]
-        return local[view], self._tracks[1][view]
-
-    def _baseline(self, t: float) -> float:
-        """m by which the robot moved in the last period (at the start: will move)."""
-        period = self._scene.sensor.period
-        at = self._walker.position(t)
-        other = t - period if self._stamps else t + period
-        return math.dist(at, self._walker.position(other))
-
-    def _withdraw(self) -> npt.NDArray[np.uint64]:
+    def _withdraw(self) -> Ids:
         """Ids of the points that a corrected map shows to be wrong: most of them."""
-        doubted, self._doubted = np.array(self._doubted, np.uint64), []
-        return doubted[self._rng.random(len(doubted)) < FOUND_WRONG]
+        doubted = np.concatenate([view.ids[view.bad] for view in self._recent])
+        self._recent = []
+        return np.asarray(doubted[self._rng.random(len(doubted)) < FOUND_WRONG])

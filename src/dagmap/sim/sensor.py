@@ -43,7 +43,7 @@ class SensorConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         self._require_range("pixel", 0.0, 100.0)
         self._require_range("focal", 1.0, 1e5)
         self._require_range("outliers", 0.0, 1.0)
-        self._require_range("tracked", 0.0, 1.0)
+        self._require_range("tracked", 0.0, 0.75)
 
 
 class Sensor:
@@ -55,48 +55,52 @@ class Sensor:
         self._up = up
         self._half = math.tan(across), math.tan(up)  # of a pinhole's image, at distance 1
 
-    def rays(self, rng: np.random.Generator, count: int) -> Floats:
-        """(count, 3) directions of length 1, evenly over the image, or over a lidar's sphere."""
-        u, v = rng.uniform(-1.0, 1.0, (2, count))
+    def rays(self, u: Floats, v: Floats) -> Floats:
+        """(..., 3) directions of length 1: even over a pinhole's image, or over a lidar's angles.
+
+        u, v: (...) chance from -1 to 1, across and up.
+        """
         if self.config.kind == "lidar":
             azimuth, elevation = math.pi * u, self._up * v
             flat = np.cos(elevation)
             parts = flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)
-            return np.stack(parts, axis=1)
-        out = np.stack([np.ones(count), self._half[0] * u, self._half[1] * v], axis=1)
-        return np.asarray(out / np.sqrt((out * out).sum(axis=1))[:, None])
+            return np.stack(parts, axis=-1)
+        y, z = self._half[0] * u, self._half[1] * v
+        ahead = 1.0 / np.sqrt(1.0 + y * y + z * z)
+        return np.stack([ahead, y * ahead, z * ahead], axis=-1)
 
     def in_view(self, points: Floats) -> Bools:
-        """(N,) whether points (N, 3) lie in the field of view, however far."""
-        x, y, z = points.T
+        """(...) whether points (..., 3) lie in the field of view, however far."""
+        x, y, z = points[..., 0], points[..., 1], points[..., 2]
         if self.config.kind == "lidar":
             return np.asarray(np.abs(z) <= math.tan(self._up) * np.sqrt(x * x + y * y))
         across, up = self._half
         return np.asarray((x > 0) & (np.abs(y) <= across * x) & (np.abs(z) <= up * x))
 
     def measure(
-        self, rng: np.random.Generator, rays: Floats, depth: Floats, baseline: float
+        self, rays: Floats, depth: Floats, noise: Floats, baseline: Floats
     ) -> tuple[Floats, Bools]:
-        """Distances (N,) with noise, and which of them a SLAM keeps.
+        """Distances (N, R) with noise, and which of them a SLAM keeps.
 
-        rays: (N, 3), depth: (N,) m along them. baseline: m by which a single camera has moved to
-        triangulate. Its disparities have the noise, so depths have one that grows with depth^2 /
-        baseline; what comes out behind the camera or beyond twice the range is dropped.
+        rays: (N, R, 3). depth: (N, R) m along them. noise: (N, R) normal. baseline: (N,) m by
+        which a single camera has moved to triangulate: its disparities have the noise, so depths
+        have one that grows with depth^2 / baseline, and what comes out behind the camera or
+        beyond twice the range is dropped.
         """
-        noise = rng.standard_normal(len(depth))
         if self.config.kind != "mono":
             measured = depth + self.config.noise * noise
             return measured, measured > 0
-        ahead = depth * rays[:, 0]
-        base = max(baseline, MIN_BASELINE)
+        ahead = depth * rays[..., 0]
+        base = np.maximum(baseline, MIN_BASELINE)[:, None]
         inverse = 1.0 / ahead + noise * (self.config.pixel / (base * self.config.focal))
         kept = inverse * (2 * self.config.range) > 1.0
         return depth / np.where(kept, inverse * ahead, 1.0), kept
 
 
-def displace(rng: np.random.Generator, count: int, share: float) -> tuple[Floats, Bools]:
-    """Factors (count,) on distances, and which of them are outliers: 0.3 to 0.85 or 1.15 to 1.6."""
-    chance, factor = rng.random((2, count))
-    wrong = chance < share
-    factor = np.where(factor < 0.55, 0.3 + factor, 0.6 + factor)
-    return np.where(wrong, factor, 1.0), wrong
+def displace(chance: Floats, share: float) -> tuple[Floats, Bools]:
+    """Factors (...) on distances, and which of them are outliers: 0.3 to 0.85 or 1.15 to 1.6.
+
+    chance: (2, ...) from 0 to 1. share: of outliers.
+    """
+    wrong, factor = chance[0] < share, 0.3 + chance[1]
+    return np.where(wrong, np.where(factor < 0.85, factor, factor + 0.3), 1.0), wrong

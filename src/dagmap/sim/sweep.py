@@ -133,9 +133,9 @@ def _attempt(item: tuple[Scenario, int]) -> Failure | None:
 def _simpler(failure: Failure) -> Iterator[Scenario]:
     """Scenarios with a little less in them, the largest cuts first."""
     full = failure.scenario
-    if failure.at < full.seconds:
-        yield msgspec.structs.replace(full, seconds=failure.at + 0.001)
-    yield msgspec.structs.replace(full, seconds=full.seconds * 0.6)
+    for seconds in (round(failure.at + 0.001, 3), round(full.seconds * 0.6, 3)):
+        if 0 < seconds < full.seconds:
+            yield msgspec.structs.replace(full, seconds=seconds)
     for name in ("partitions", "crashes"):
         yield from (
             msgspec.structs.replace(full, **{name: rest})

@@ -40,7 +40,7 @@ class Lies(msgspec.Struct, frozen=True, kw_only=True):
     honest_points: int  # features of honest robots that are in the map without the liars
     honest_lost: int  # of these, rejected with the liars
     proven_nodes: int  # hits less misses of honest robots exceed the liars' misses, all together
-    proven_lost: int  # of these, rejected with the liars: must be 0
+    proven_lost: int  # of these, no observation is in a node that is kept: must be 0
     liars_only: int  # nodes that no honest robot saw
     liars_confirmed: int  # of these, confirmed: must be 0 where `witnesses` exceeds the liars
     false_confirmed: int  # confirmed nodes that no honest robot saw, far from every surface
@@ -89,12 +89,16 @@ def judge_lies(
     kept = before.states[was] != State.REJECTED
     lost = kept & (states[now] == State.REJECTED)
     proven = _proven(before, liars * say)
+    survives = np.zeros(len(before.states), np.bool_)
+    survives[was[~(states[now] == State.REJECTED)]] = True
+    seen = np.zeros(len(before.states), np.bool_)
+    seen[was] = True
     return Lies(
         liars=liars,
         honest_points=int(kept.sum()),
         honest_lost=int(lost.sum()),
         proven_nodes=int(proven.sum()),
-        proven_lost=len(np.unique(was[lost & proven[was]])),
+        proven_lost=int((proven & seen & ~survives).sum()),
         liars_only=int((~truly).sum()),
         liars_confirmed=int(confirmed.sum()),
         false_confirmed=int((confirmed & far).sum()),

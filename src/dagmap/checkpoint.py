@@ -1,0 +1,95 @@
+"""A folded state as bytes, so that a restart need not verify and fold the whole ledger again.
+
+    MAC 32 | size of the head 4 | head: what it belongs to | the ledger and the fold, pickled
+
+Only what the robot's own key has authenticated is ever unpickled. A checkpoint says which
+transactions it stands for; one that does not match what the store holds is not used, and costs
+nothing but the time that it would have saved. Transactions are not in it: it refers to the store's.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import pickle
+from collections.abc import Mapping, Sequence
+from itertools import islice
+from typing import cast
+
+import msgspec
+
+from .config import Config
+from .consensus import Consensus
+from .identity import Identity
+from .ledger import Ledger
+from .model import TransactionId
+
+VERSION = 1  # of what is pickled: any change to the classes of the ledger or the fold counts it up
+
+
+class _Head(msgspec.Struct, frozen=True):
+    version: int
+    config: bytes
+    count: int  # transactions of the store, from its beginning
+    stored: bytes  # BLAKE2b-256 over their ids, in the store's order
+
+
+def save(
+    ledger: Ledger, consensus: Consensus, identity: Identity, stored: Sequence[TransactionId]
+) -> bytes:
+    """The state after the transactions with these ids: all that were accepted, as stored."""
+    head = msgspec.msgpack.encode(_head(ledger.config, stored))
+    out = io.BytesIO()
+    _Pickler(out, ledger, set(stored)).dump((ledger, consensus))
+    body = len(head).to_bytes(4, "little") + head + out.getbuffer()
+    return _mac(identity, body) + body
+
+
+def load(
+    data: bytes, identity: Identity, config: Config, transactions: Mapping[TransactionId, bytes]
+) -> tuple[Ledger, Consensus, int] | None:
+    """The state and how many of the store's transactions (in its order) it stands for.
+
+    None where it is damaged, of another robot, version or configuration, or of another store.
+    """
+    body = memoryview(data)[32:]
+    if len(data) < 36 or data[:32] != _mac(identity, body):
+        return None
+    size = int.from_bytes(body[:4], "little")
+    head = msgspec.msgpack.decode(body[4 : 4 + size], type=_Head)
+    stored = list(islice(transactions, head.count))
+    if head != _head(config, stored):
+        return None
+    unpickler = _Unpickler(io.BytesIO(body[4 + size :]), transactions)
+    ledger, consensus = cast("tuple[Ledger, Consensus]", unpickler.load())
+    return ledger, consensus, head.count
+
+
+def _head(config: Config, stored: Sequence[TransactionId]) -> _Head:
+    over_all = hashlib.blake2b(b"".join(stored), digest_size=32).digest()
+    return _Head(VERSION, msgspec.json.encode(config), len(stored), over_all)
+
+
+def _mac(identity: Identity, body: bytes | memoryview) -> bytes:
+    key = identity.secret(b"dagmap checkpoint")
+    return hashlib.blake2b(body, digest_size=32, key=key).digest()
+
+
+class _Pickler(pickle.Pickler):
+    """Names transactions that are stored by their ids, and leaves their bytes out."""
+
+    def __init__(self, file: io.BytesIO, ledger: Ledger, stored: set[TransactionId]) -> None:
+        super().__init__(file, protocol=5)
+        self._ids = {id(tx.data): tx.id for tx in ledger.all() if tx.id in stored}
+
+    def persistent_id(self, thing: object) -> TransactionId | None:
+        return self._ids.get(id(thing)) if type(thing) is bytes else None
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, file: io.BytesIO, transactions: Mapping[TransactionId, bytes]) -> None:
+        super().__init__(file)
+        self._transactions = transactions
+
+    def persistent_load(self, id_: TransactionId) -> bytes:
+        return self._transactions[id_]

@@ -1,0 +1,128 @@
+"""Robots that lie: the honest ones agree, and what they lose and believe stays within the bound."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from dagmap import Config, GraphConfig
+from dagmap.config import FoldConfig, TransactionConfig
+from dagmap.model import ConfigError
+from dagmap.sim.building import SceneConfig
+from dagmap.sim.liars import LIARS, make_liar
+from dagmap.sim.mission import Mission, Report
+from dagmap.sim.network import Link
+from dagmap.sim.scenario import Liars, Scenario
+from dagmap.sim.sensor import SensorConfig
+from dagmap.sim.sweep import attempt
+from dagmap.sim.truth import judge_lies
+from dagmap.sim.walk import MotionConfig
+
+ROOM = Scenario(  # everybody looks at the walls of one small room
+    name="a room",
+    seconds=15.0,
+    config=Config(
+        same_origin=True,
+        transaction=TransactionConfig(proof_of_work_bits=0),
+        graph=GraphConfig(reference_pitch=0.25, max_parent_distance=0.75),
+        fold=FoldConfig(delta=0.1, max_ray=8.0),
+    ),
+    scene=SceneConfig(rooms=(1, 1), room=3.5, objects=1),
+    motion=MotionConfig(drift=0.0, drift_yaw=0.0, loop_closures=False),
+    sensor=SensorConfig(points=60, outliers=0.0),
+)
+SAYING = ["forger", "eraser", "splitter", "wrong-frame"]  # who lie about what is there
+
+
+def room(kind: str, liars: int, honest: int = 3, witnesses: int = 2, **changes: object) -> Scenario:
+    fold = msgspec.structs.replace(ROOM.config.fold, witnesses=witnesses)
+    config = msgspec.structs.replace(ROOM.config, fold=fold)
+    lying = (Liars(kind=kind, count=liars),) if liars else ()
+    return msgspec.structs.replace(
+        ROOM, robots=honest + liars, liars=lying, config=config, **changes
+    )
+
+
+def played(scenario: Scenario, seed: int = 1) -> tuple[Mission, Report]:
+    mission = Mission(scenario, seed)
+    report = mission.run()
+    assert report.agreed
+    return mission, report
+
+
+@pytest.mark.parametrize("kind", sorted(LIARS))
+def test_the_honest_agree_whatever_one_does(kind: str) -> None:
+    few = msgspec.structs.replace(ROOM.sensor, points=20)
+    scenario = room(kind, 1, seconds=8.0, sensor=few, link=Link(loss=0.1))
+    assert attempt(scenario, 3) is None, "every invariant holds, and all agree"
+
+
+@pytest.mark.parametrize("kind", SAYING)
+@pytest.mark.parametrize("witnesses", [2, 3])
+def test_what_only_liars_say_is_confirmed_from_witnesses_liars_on(
+    kind: str, witnesses: int
+) -> None:
+    lies = played(room(kind, witnesses - 1, witnesses=witnesses))[1].lies
+    assert lies is not None and lies.liars_only > 50 and lies.liars_confirmed == 0
+    if kind != "eraser":
+        beyond = played(room(kind, witnesses, witnesses=witnesses))[1].lies
+        assert beyond is not None and beyond.liars_confirmed > 0, "one liar more and the bound ends"
+
+
+@pytest.mark.parametrize("kind", ["forger", "eraser", "wrong-frame"])
+@pytest.mark.parametrize("liars", [1, 2])
+def test_what_outweighs_the_liars_is_never_lost(kind: str, liars: int) -> None:
+    lies = played(room(kind, liars))[1].lies
+    assert lies is not None and lies.proven_nodes > 50 and lies.proven_lost == 0
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_splitting_what_others_saw_gains_next_to_nothing(seed: int) -> None:
+    """Seeds planted beside a place can share its hits out among nodes that are outvoted apart."""
+    lies = played(room("splitter", 1), seed)[1].lies
+    assert lies is not None and lies.proven_lost <= lies.proven_nodes // 100
+
+
+def test_one_witness_less_and_it_is_lost() -> None:
+    """Erasers outvote places where honest hits exceed honest misses by no more than they are."""
+    mission, _ = played(room("eraser", 3))
+    honest = mission.honest
+    assert judge_lies(honest[0], honest, liars=3).proven_lost == 0
+    assert judge_lies(honest[0], honest, liars=2).proven_lost > 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "reason"),
+    [
+        ("wrong-prover", "signature does not match"),
+        ("false-dater", "Lamport time does not follow from its references"),
+        ("babbler", "checksum does not match"),
+    ],
+)
+def test_a_refusal_says_why(kind: str, reason: str) -> None:
+    few = msgspec.structs.replace(ROOM.sensor, points=20)
+    report = played(room(kind, 1, seconds=8.0, sensor=few))[1]
+    assert report.rejected.get(reason, 0) > 0, report.rejected
+
+
+def test_a_fork_is_cut_on_every_robot() -> None:
+    few = msgspec.structs.replace(ROOM.sensor, points=20)
+    mission, _ = played(room("forker", 1, seconds=8.0, sensor=few))
+    liar = mission.fleet.robots["forker00"].author
+    cuts = {robot.agent.ledger.chain(liar).cut for robot in mission.honest}
+    assert len(cuts) == 1 and cuts != {None}
+
+
+def test_a_flood_stays_within_the_waiting_room() -> None:
+    few = msgspec.structs.replace(ROOM.sensor, points=10)
+    ledger = msgspec.structs.replace(ROOM.config.ledger, waiting_transactions=50)
+    config = msgspec.structs.replace(ROOM.config, ledger=ledger)
+    scenario = msgspec.structs.replace(
+        room("flooder", 1, seconds=6.0, sensor=few, link=Link(loss=0.3)), config=config
+    )
+    assert attempt(scenario, 5) is None
+
+
+def test_an_unknown_liar_is_refused() -> None:
+    with pytest.raises(ConfigError, match="'thief' is unknown; one of .*forger"):
+        make_liar("thief", 0)
