@@ -9,12 +9,14 @@ from typing import Annotated
 import typer
 
 from .. import __version__
+from .keys import app as keys
 
 app = typer.Typer(
     help="One map for a fleet of robots, the same on every robot, without a central station.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
+app.add_typer(keys, name="keys")
 
 
 def _version(wanted: bool) -> None:
@@ -124,15 +126,17 @@ def evaluate(
 @app.command()
 def simulate(
     scenarios: Annotated[list[Path], typer.Argument(help="TOML file of a scenario.")],
-    seed: Annotated[int, typer.Option(help="What all chance is drawn from.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="What all chance is drawn from.")] = 0,
     seeds: Annotated[
         int | None,
-        typer.Option(help="Sweep: so many seeds, every invariant checked after every event."),
+        typer.Option(
+            min=1, help="Sweep: so many seeds, with invariants checked after every event."
+        ),
     ] = None,
     timeline: Annotated[
         Path | None, typer.Option(help="Write every event to this file; - for the terminal.")
     ] = None,
-    jobs: Annotated[int, typer.Option(help="Processes of a sweep; 0: one a core.")] = 0,
+    jobs: Annotated[int, typer.Option(min=0, help="Processes of a sweep; 0: one a core.")] = 0,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Run a whole fleet in one process, with faults and liars. The same seed gives the same run."""

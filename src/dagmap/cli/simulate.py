@@ -41,6 +41,10 @@ class Simulate:
 
     def run(self) -> int:
         """0: all agreed; 1: a promise was broken, or no agreement. Raises DagmapError."""
+        if self.timeline is not None and self.seeds is not None:
+            raise DagmapError("--timeline is of one run; leave out --seeds and name a --seed")
+        if self.timeline == Path("-") and self.json:
+            raise DagmapError("--timeline - and --json both want the terminal; name a file")
         scenarios = [load_scenario(path) for path in self.scenarios]
         warm_up(self.console)
         if self.seeds is not None:
@@ -139,7 +143,7 @@ def _rows(report: Report) -> list[tuple[str, str]]:
     states = ", ".join(f"{report.map[s.name.lower()]:,} {s.name.lower()}" for s in State)
     rows = [
         ("robots", f"{report.robots}, {report.liars} of them liars"),
-        ("agreement after the last cycle", agreed + ideal),
+        ("agreement after the last news", agreed + ideal),
         ("digest", f"{report.digest[:16]}... on all" if report.agreed else "THE ROBOTS DISAGREE"),
         ("map", f"{report.map['nodes']:,} nodes: {states}"),
         ("transactions", f"{report.transactions:,}"),

@@ -56,7 +56,9 @@ class Crash(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     def __post_init__(self) -> None:
         if not (self.at >= 0 and self.down >= 0):
-            raise ConfigError(f"crash at {self.at} s for {self.down} s: times of at least 0")
+            raise ConfigError(
+                f"Crash: at = {self.at!r}, down = {self.down!r}, but times of at least 0 are wanted"
+            )
 
 
 @dataclass(frozen=True, slots=True)

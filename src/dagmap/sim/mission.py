@@ -9,12 +9,12 @@ from typing import TypeAlias
 
 import msgspec
 
-from ..model import Cycle, Rejected, State
+from ..model import Accepted, Cycle, Forked, Issued, Rejected, State
 from ..worldmap import WorldMap
 from .fleet import Check, Fleet
 from .liars import make_liar
 from .network import Network, Position
-from .robot import Happening, Recording, Robot, Source, Timed
+from .robot import Happening, Recording, Restarted, Robot, Source, Timed
 from .scenario import Scenario
 from .scene import Scene, Walker
 from .truth import Lies, Quality, judge_lies, judge_quality
@@ -32,7 +32,7 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     liars: int
     agreed: bool  # all honest robots hold the same transactions and the same map
     digest: str
-    agreement_s: float | None  # from the last cycle of the mission
+    agreement_s: float | None  # see `Mission.play`
     agreement_periods: float | None  # the same in announcement periods
     ideal_s: float | None  # what a flood without loss would take from then on
     simulated_s: float
@@ -42,7 +42,7 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     transactions: int  # of honest robots
     bytes_sent: int  # a broadcast once
     bytes_received: int
-    bytes_minimum: int  # one copy of every transaction for every robot but its author
+    bytes_minimum: int  # one copy of every transaction for every honest robot but its author
     divergence: list[tuple[float, float]]  # (s, largest share of transactions that one lacks)
     map: dict[str, int]
     rejected: dict[str, int]  # refusals by honest robots, by reason
@@ -85,6 +85,7 @@ class Mission:
         self.fleet = Fleet(scenario.config, network, self._note, check=check, tick=scenario.tick)
         self._network = network
         self._divergence: list[tuple[float, float]] = []
+        self._cause = self._effect = 0.0  # s: last honest news or return, and last word of any
         self._set_up()
 
     @property
@@ -100,7 +101,8 @@ class Mission:
     def play(self, told: Told | None = None) -> float | None:
         """Play the mission and let the fleet agree.
 
-        Returns how long that took after the last cycle, s; None where it has not.
+        Returns how long that took, s: from when the last honest transaction was issued, the last
+        partition over and the last robot there, to when the last robot knew. None: it has not.
         """
         scenario, joining = self.scenario, dict(self._joining())
         while self.fleet.now < scenario.seconds:
@@ -111,7 +113,12 @@ class Mission:
                 del joining[name]
         while not self._quiet() and self.fleet.now < scenario.seconds + scenario.patience:
             self._pass(self.fleet.now + scenario.tick, told)
-        return self.fleet.now - scenario.seconds if self._quiet() else None
+        return max(0.0, self._effect - self._settled()) if self._quiet() else None
+
+    def _settled(self) -> float:
+        """When the last of what keeps robots from agreeing was over, s."""
+        ends = [cut.end for cut in self.scenario.partitions if cut.end <= self.fleet.now]
+        return max([self._cause, *ends])
 
     def _build_scene(self) -> Scene:
         s = self.scenario
@@ -127,9 +134,6 @@ class Mission:
         for name in self.scenario.names:
             if name not in late:
                 self._join(name)
-        for crash in self.scenario.crashes:
-            if crash.robot not in late:
-                self.fleet.crash(crash)
 
     def _joining(self) -> Iterator[tuple[str, float]]:
         """Names of the honest robots that come late, and when."""
@@ -148,10 +152,20 @@ class Mission:
         else:
             source = Recording(self._recordings.get(name, ()))
         self.fleet.play(name, source)
+        self._cause = self.fleet.now
+        for crash in scenario.crashes:
+            if crash.robot == name and crash.at >= self.fleet.now:
+                self.fleet.crash(crash)
 
     def _note(self, robot: Robot, happening: Happening) -> None:
-        if isinstance(happening, Rejected) and robot.honest:
-            self._rejected[happening.reason.value] += 1
+        if robot.honest:
+            match happening:
+                case Accepted() | Forked():
+                    self._effect = self.fleet.now
+                case Issued() | Restarted():
+                    self._cause = self.fleet.now
+                case Rejected(reason):
+                    self._rejected[reason.value] += 1
         if self._on_event is not None:
             self._on_event(robot, happening)
 
@@ -213,7 +227,12 @@ class Mission:
     def _report(self, took: float | None, wall: float) -> Report:
         robots, honest = list(self.fleet.robots.values()), self.honest
         digests = {robot.agent.digest() for robot in honest if robot.up}
-        unique = {tx.id: len(tx.data) for robot in honest for tx in robot.agent.ledger}
+        good = {robot.author for robot in honest}
+        unique = {
+            tx.id: len(tx.data) * (len(honest) - (tx.author in good))
+            for robot in honest
+            for tx in robot.agent.ledger
+        }
         world = honest[0].agent.map
         period = self.scenario.config.sync.announce_period
         return Report(
@@ -225,15 +244,15 @@ class Mission:
             digest=min(digests).hex() if digests else "",
             agreement_s=took,
             agreement_periods=None if took is None else took / period,
-            ideal_s=self._ideal(self.scenario.seconds),
+            ideal_s=self._ideal(self._settled()),
             simulated_s=self.fleet.now,
             wall_s=wall,
             messages=self.fleet.delivered,
             messages_per_s=self.fleet.delivered / max(wall, 1e-9),
-            transactions=sum(robot.transactions for robot in honest),
+            transactions=sum(len(robot.own) for robot in honest),
             bytes_sent=sum(robot.bytes_sent for robot in robots),
             bytes_received=sum(robot.bytes_received for robot in honest),
-            bytes_minimum=(len(honest) - 1) * sum(unique.values()),
+            bytes_minimum=sum(unique.values()),
             divergence=self._divergence,
             map={"nodes": len(world), **{s.name.lower(): world.count(s) for s in State}},
             rejected=dict(sorted(self._rejected.items())),

@@ -28,7 +28,8 @@ class Link(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     def __post_init__(self) -> None:
         self._require(0 <= self.loss < 1, "loss", "a probability from 0 up to, not including, 1")
-        self._require(0 <= self.delay[0] <= self.delay[1], "delay", "two times, the shorter first")
+        low, high = self.delay
+        self._require(0 <= low <= high < math.inf, "delay", "two times, the shorter first,")
         self._require(0 <= self.tail < math.inf, "tail", "a time of at least 0")
         self._require(0 <= self.duplicate <= 1, "duplicate", "a probability")
         self._require(self.reach is None or self.reach > 0, "reach", "a distance above 0")
@@ -53,7 +54,10 @@ class Partition(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
     def __post_init__(self) -> None:
         if not 0 <= self.start <= self.end:
-            raise ConfigError(f"partition from {self.start} s to {self.end} s: the end comes first")
+            raise ConfigError(
+                f"Partition: start = {self.start!r}, end = {self.end!r}, but two times of at "
+                "least 0 are wanted, the earlier first"
+            )
 
     def cuts(self, sender: str, receiver: str, now: float) -> bool:
         if not self.start <= now < self.end:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections import Counter
 from pathlib import Path
@@ -35,7 +36,7 @@ class Clocks(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):
     drift: float = 0.0  # s per s, below 0.5
 
     def __post_init__(self) -> None:
-        self._require(self.offset >= 0, "offset", "a time of at least 0")
+        self._require(0 <= self.offset < math.inf, "offset", "a time of at least 0")
         self._require(0 <= self.drift < 0.5, "drift", "0 up to 0.5 s/s")
 
 
@@ -95,17 +96,21 @@ class Scenario(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         self._require(1 <= self.robots <= 1000, "robots", "1 to 1000")
-        self._require(self.seconds > 0, "seconds", "a time above 0")
-        self._require(self.patience > 0, "patience", "a time above 0")
+        for name in ("seconds", "patience"):
+            self._require(0 < getattr(self, name) < math.inf, name, "a time above 0")
         self._require(0.001 <= self.tick <= 60, "tick", "0.001 to 60 s")
         honest = self.robots - self.lying
         self._require(honest >= 1, "liars", f"fewer than the {self.robots} robots")
         self._require(len(self.late) < honest, "late", "at least one honest robot on time")
+        on_time = all(0 <= at <= self.seconds for at in self.late)
+        self._require(on_time, "late", f"times from 0 to the {self.seconds} s of the mission")
         self._require(
             not self.recordings or len(self.recordings) == self.robots,
             "recordings",
             f"one for each of the {self.robots} robots",
         )
+        placed = not self.recordings or self.link.reach is None
+        self._require(placed, "recordings", "a link without reach, for want of true positions,")
         known = set(self.names)
         for crash in self.crashes:
             self._require(crash.robot in known, "crashes", f"robots out of {sorted(known)}")
@@ -120,8 +125,12 @@ class Scenario(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):
     @property
     def names(self) -> list[str]:
         """r00, r01, ... for honest robots, then forger00, ... for liars."""
-        honest = [f"r{i:02d}" for i in range(self.robots - self.lying)]
-        return honest + [f"{group.kind}{i:02d}" for group in self.liars for i in range(group.count)]
+        names, numbers = [f"r{i:02d}" for i in range(self.robots - self.lying)], Counter[str]()
+        for group in self.liars:
+            for _ in range(group.count):
+                names.append(f"{group.kind}{numbers[group.kind]:02d}")
+                numbers[group.kind] += 1
+        return names
 
     def drawn(self, seed: int) -> Scenario:
         """The same scenario with the faults and the liars that the seed draws listed."""

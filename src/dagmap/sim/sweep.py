@@ -135,7 +135,7 @@ def _simpler(failure: Failure) -> Iterator[Scenario]:
     full = failure.scenario
     for seconds in (round(failure.at + 0.001, 3), round(full.seconds * 0.6, 3)):
         if 0 < seconds < full.seconds:
-            yield msgspec.structs.replace(full, seconds=seconds)
+            yield _shorter(full, seconds)
     for name in ("partitions", "crashes"):
         yield from (
             msgspec.structs.replace(full, **{name: rest})
@@ -155,6 +155,11 @@ def _simpler(failure: Failure) -> Iterator[Scenario]:
     if full.motion.loop_closures:
         motion = msgspec.structs.replace(full.motion, loop_closures=False)
         yield msgspec.structs.replace(full, motion=motion)
+
+
+def _shorter(full: Scenario, seconds: float) -> Scenario:
+    late = tuple(min(at, seconds) for at in full.late)
+    return msgspec.structs.replace(full, seconds=seconds, late=late)
 
 
 def _without_one(items: tuple[T, ...]) -> Iterator[tuple[T, ...]]:

@@ -1,0 +1,314 @@
+"""The figures of docs/reliability.md: `make reliability` (hours), or for a look at them
+`python bench/reliability.py --seeds 60 --runs 2 --seconds 30 --out /tmp/figures` (minutes).
+
+Not part of `dagmap bench`: it measures the promises, not the machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import sys
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+import numpy as np
+from rich.progress import Progress
+
+from dagmap.config import Config, FoldConfig, GraphConfig, SyncConfig, TransactionConfig
+from dagmap.sim.fleet import Crash
+from dagmap.sim.mission import Mission, Report
+from dagmap.sim.network import Link, Partition
+from dagmap.sim.scenario import Liars, Scenario, load_scenario
+from dagmap.sim.scene import Scene, SceneConfig
+from dagmap.sim.sensor import SensorConfig
+from dagmap.sim.sweep import sweep
+from dagmap.sim.truth import Lies, judge_lies
+from dagmap.sim.walk import MotionConfig
+from reliability_text import write
+
+ROOT = Path(__file__).parents[1]
+LONG = ("hundred", "hour")  # scenarios that are runs of their own, not part of the sweep
+LOSSES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
+KINDS = ("forger", "eraser", "splitter", "wrong-frame")
+FLEET = 8  # robots in the runs with loss and in those with liars
+A, B = TypeVar("A"), TypeVar("B")
+Tell = Callable[[str, float], None]  # (what is measured, share done)
+
+SMALL = Scenario(
+    robots=FLEET,
+    seconds=5.05,
+    patience=600.0,
+    sensor=SensorConfig(points=16, tracked=0.4),
+    config=Config(
+        same_origin=True,
+        transaction=TransactionConfig(proof_of_work_bits=2),
+        graph=GraphConfig(reference_pitch=0.25, max_parent_distance=0.75),
+        fold=FoldConfig(delta=0.1),
+    ),
+)
+
+
+def changed(scenario: Scenario, **fields: object) -> Scenario:
+    return msgspec.structs.replace(scenario, **fields)
+
+
+# Every robot hears every other; or each stands in its room of a row and hears the next ones only.
+TOPOLOGIES = {
+    "all hear all": SMALL,
+    "a chain": changed(
+        SMALL,
+        scene=SceneConfig(rooms=(FLEET, 1)),
+        motion=MotionConfig(kind="rotate"),
+        link=Link(reach=9.0),
+    ),
+}
+# Partitions and crashes of which the plot shows what they do.
+TROUBLED = changed(
+    SMALL,
+    name="trouble",
+    seconds=120.0,
+    link=Link(loss=0.2),
+    partitions=(
+        Partition(start=15.0, end=40.0, robots=("r00", "r01", "r02", "r03")),
+        Partition(start=60.0, end=75.0, robots=("r05",), direction="in"),
+    ),
+    crashes=(
+        Crash(robot="r02", at=25.0, down=5.0),
+        Crash(robot="r06", at=85.0, down=10.0, moment="unsynced"),
+        Crash(robot="r07", at=100.0, down=5.0, moment="unsent"),
+    ),
+)
+# One room, seen from all sides, so that points find witnesses.
+CROWDED = changed(
+    SMALL,
+    scene=SceneConfig(rooms=(1, 1)),
+    motion=MotionConfig(drift=0.0, drift_yaw=0.0),
+    sensor=SensorConfig(points=100, tracked=0.2),
+    seconds=20.05,
+)
+# Transactions of a few points from everybody to everybody.
+BUSY = changed(
+    SMALL,
+    name="many messages",
+    robots=40,
+    seconds=20.0,
+    tick=0.5,
+    sensor=SensorConfig(points=8, tracked=0.0),
+    config=msgspec.structs.replace(SMALL.config, sync=SyncConfig(announce_period=5.0)),
+)
+
+
+def timed(scenario: Scenario, tell: Callable[[float], None]) -> dict[str, Any]:
+    """One run, alone in this process."""
+    report = Mission(scenario, 1).run(lambda now: tell(min(1.0, now / scenario.seconds)))
+    return {"mission_s": scenario.seconds, **msgspec.to_builtins(report)}
+
+
+def busy(tell: Callable[[float], None]) -> dict[str, Any]:
+    """Agents and network alone: what the robots see is made beforehand."""
+    b = BUSY
+    scene = Scene(b.scene, b.sensor, b.motion, b.robots, 1)
+    cycles = {name: list(scene.robot(i).cycles(b.seconds)) for i, name in enumerate(b.names)}
+    report = Mission(b, 1, cycles).run(lambda now: tell(min(1.0, now / b.seconds)))
+    return msgspec.to_builtins(report)
+
+
+def fly(item: tuple[Scenario, int]) -> Report:
+    """One run."""
+    return Mission(*item).run()
+
+
+def lie(item: tuple[Scenario, int]) -> Lies:
+    """What liars did to one run; without liars, the same comparison."""
+    scenario, seed = item
+    mission = Mission(scenario, seed)
+    if mission.play() is None:
+        raise RuntimeError(f"no agreement with {scenario.liars} and seed {seed}")
+    s, honest = mission.scenario, mission.honest
+    scene = Scene(s.scene, s.sensor, s.motion, s.robots, seed)
+    return judge_lies(honest[0], honest, s.lying, scene)
+
+
+def spread(
+    work: Callable[[A], B], items: list[A], jobs: int, told: Callable[[float], None]
+) -> list[B]:
+    """The results in the order of the items, from several processes."""
+    results: list[B] = []
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        for result in pool.map(work, items):
+            results.append(result)
+            told(len(results) / len(items))
+    return results
+
+
+def swept(seeds: int, jobs: int, tell: Callable[[float], None]) -> dict[str, Any]:
+    """Every scenario but the long ones, with about `seeds` seeds in all."""
+    paths = [path for path in sorted((ROOT / "scenarios").glob("*.toml")) if path.stem not in LONG]
+    each = -(-seeds // len(paths))
+    total = each * len(paths)
+    scenarios = [load_scenario(path) for path in paths]
+    failure = sweep(scenarios, range(each), jobs, lambda done: tell(done / total))
+    return {
+        "scenarios": [path.stem for path in paths],
+        "seeds_each": each,
+        "runs": total,
+        "failure": None if failure is None else f"seed {failure.seed}: {failure.detail}",
+    }
+
+
+def long_run(name: str, seconds: float | None, tell: Callable[[float], None]) -> dict[str, Any]:
+    """A scenario that is a run of its own, shortened for a quick look."""
+    scenario = load_scenario(ROOT / "scenarios" / f"{name}.toml")
+    if seconds is not None:
+        parts = tuple(msgspec.structs.replace(p, end=seconds) for p in scenario.partitions)
+        scenario = changed(scenario, seconds=seconds, partitions=parts)
+    return timed(scenario, tell)
+
+
+def lossy(
+    losses: Iterable[float], runs: int, jobs: int, tell: Callable[[float], None]
+) -> list[dict[str, Any]]:
+    """Time to agreement and bytes, a row for each topology and loss."""
+    cells = [(topology, loss) for topology in TOPOLOGIES for loss in losses]
+    items = []
+    for topology, loss in cells:
+        scenario = TOPOLOGIES[topology]
+        link = msgspec.structs.replace(scenario.link, loss=loss)
+        items += [(changed(scenario, link=link), seed) for seed in range(runs)]
+    reports = spread(fly, items, jobs, tell)
+    return [
+        _lossy_row(topology, loss, reports[i * runs : (i + 1) * runs])
+        for i, (topology, loss) in enumerate(cells)
+    ]
+
+
+def _lossy_row(topology: str, loss: float, reports: list[Report]) -> dict[str, Any]:
+    """Runs in which some robot was out of everybody's reach are left out, and counted."""
+    joined = [r for r in reports if r.ideal_s is not None]
+    took = [r.agreement_periods for r in joined if r.agreement_periods is not None]
+    over = [r.bytes_received / r.bytes_minimum for r in joined]
+    period = SMALL.config.sync.announce_period
+    p50, p99 = np.percentile(took, [50, 99]).tolist() if took else (None, None)
+    return {
+        "topology": topology,
+        "loss": loss,
+        "runs": len(joined),
+        "apart": len(reports) - len(joined),
+        "never": len(joined) - len(took),
+        "p50": p50,
+        "p99": p99,
+        "ideal": float(np.median([r.ideal_s for r in joined])) / period if joined else None,
+        "bytes_over_minimum": float(np.median(over)) if over else None,
+    }
+
+
+def lying(runs: int, jobs: int, tell: Callable[[float], None]) -> list[dict[str, Any]]:
+    """What liars did, a row for each `witnesses`, kind and number of liars."""
+    cells, items = [], []
+    for witnesses in (2, 3):
+        fold = msgspec.structs.replace(CROWDED.config.fold, witnesses=witnesses)
+        config = msgspec.structs.replace(CROWDED.config, fold=fold)
+        for kind in KINDS:
+            for count in range(5):
+                group = (Liars(kind=kind, count=count),) if count else ()
+                cells.append({"witnesses": witnesses, "kind": kind, "liars": count})
+                scenario = changed(CROWDED, config=config, liars=group)
+                items += [(scenario, seed) for seed in range(runs)]
+    judged = spread(lie, items, jobs, tell)
+    return [
+        cell | _summed(judged[i * runs : (i + 1) * runs]) | {"runs": runs}
+        for i, cell in enumerate(cells)
+    ]
+
+
+def _summed(judged: list[Lies]) -> dict[str, int]:
+    names = [name for name in Lies.__struct_fields__ if name != "liars"]
+    return {name: sum(getattr(one, name) for one in judged) for name in names}
+
+
+def troubled(tell: Callable[[float], None]) -> dict[str, Any]:
+    """How far apart the robots are while things go wrong."""
+    faults = {"partitions": TROUBLED.partitions, "crashes": TROUBLED.crashes}
+    return timed(TROUBLED, tell) | msgspec.to_builtins(faults)
+
+
+def fuzzed() -> int | None:
+    """The largest number of executions that docs/fuzzing.md records, if it is there."""
+    path = ROOT / "docs" / "fuzzing.md"
+    text = path.read_text() if path.exists() else ""
+    found = re.findall(r"([\d,]{5,})\s+executions", text)
+    return max((int(number.replace(",", "")) for number in found), default=None)
+
+
+def measure(options: argparse.Namespace, tell: Tell) -> dict[str, Any]:
+    """All figures. What is timed runs alone; the rest side by side."""
+
+    def about(what: str) -> Callable[[float], None]:
+        return lambda share: tell(what, share)
+
+    jobs = options.jobs
+    return {
+        "busy": busy(about("messages a second")),
+        "hundred": long_run("hundred", options.seconds, about("a hundred robots")),
+        "hour": long_run("hour", options.seconds, about("an hour apart")),
+        "divergence": troubled(about("divergence")),
+        "loss": lossy(LOSSES, options.runs, jobs, about("loss")),
+        "liars": lying(max(1, options.runs // 10), jobs, about("liars")),
+        "sweep": swept(options.seeds, jobs, about("sweep")),
+        "fuzz_executions": fuzzed(),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Write docs/reliability.md and its plots.")
+    parser.add_argument("--seeds", type=int, default=10_000, help="runs of the sweep, in all")
+    parser.add_argument("--runs", type=int, default=50, help="seeds for each loss")
+    parser.add_argument("--seconds", type=float, help="shorten the long missions, for a look")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs", help="folder of the document")
+    parser.add_argument("--json", action="store_true", help="print all figures as well")
+    options = parser.parse_args()
+    with Progress(console=_stderr()) as progress:
+        tasks: dict[str, Any] = {}
+
+        def tell(what: str, share: float) -> None:
+            if what not in tasks:
+                tasks[what] = progress.add_task(what, total=1.0)
+            progress.update(tasks[what], completed=share)
+
+        figures = measure(options, tell)
+    figures["options"] = {
+        "seeds": options.seeds,
+        "runs": options.runs,
+        "seconds": options.seconds,
+        "jobs": options.jobs,
+    }
+    figures["settings"] = {
+        "fleet": FLEET,
+        "mission": SMALL.seconds,
+        "points": SMALL.sensor.points,
+        "period": SMALL.config.sync.announce_period,
+        "trouble_loss": TROUBLED.link.loss,
+    }
+    write(figures, options.out)
+    if options.json:
+        sys.stdout.write(json.dumps(figures) + "\n")
+    if figures["sweep"]["failure"] is not None:
+        sys.exit(f"a promise was broken: {figures['sweep']['failure']}")
+
+
+def _stderr() -> Any:
+    from rich.console import Console
+
+    return Console(stderr=True)
+
+
+if __name__ == "__main__":
+    main()

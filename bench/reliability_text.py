@@ -1,0 +1,234 @@
+"""How docs/reliability.md says what bench/reliability.py has measured: text, tables and plots."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Iterable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+mpl.use("Agg")
+
+BOUND = "To be stated."
+
+TEXT = """\
+# Does it hold under faults and liars?
+
+Every figure here is of one command, `make reliability`, and of seeds, so that everybody gets the
+same (wall times excepted). This is the outcome of `python bench/reliability.py {arguments}` with
+dagmap {dagmap}, Python {python}, numpy {numpy}, numba {numba}, on {machine} with {cores} cores.
+[simulator.md](simulator.md) says how the simulator works, and how to write a scenario.{shortened}
+
+## In short
+
+| what | figure |
+|---|---|
+| seeds swept | {sweep} |
+| largest run | {hundred} |
+| after a partition of {hour_for} | {hour} |
+| messages a second of wall time, small transactions, one core | {busy} |
+| fuzz executions | {fuzz} |
+
+The sweep checks after every event that the graph is as Section 4.1 wants it, chains are unbroken,
+dated and signed, memory is bounded and nothing was forgotten; now and then, that the fold is that
+of the set from scratch and nothing is confirmed without witnesses; and at the end, that all
+honest robots have one digest. Scenarios: {scenarios}, {seeds_each} seeds each (`make sweep`).
+
+## Loss
+
+{fleet} robots work for {mission:.0f} s, a transaction of about {points} points a second each.
+Then they have time to agree: from when the last transaction was issued until the last robot holds
+everything, in announcement periods ({period:g} s), over {runs} seeds. *Ideal* is a flood without
+loss over the same links, each hop one mean delay. In *all hear all* a transaction comes at once
+or by repair; in *a chain* each robot stands in one room of a row and hears the next ones, so that
+news travels by announcement, question and answer. *Bytes* are all that robots received, over one
+copy of each transaction for everybody but its author (median).
+
+{loss}
+
+![Time to agreement by loss](agreement.png)
+
+## Divergence
+
+{fleet} robots, {trouble_loss:.0%} loss, two partitions (the second one-way: the robot sends but
+does not hear) and three crashes. The line is the largest share of all transactions that one robot
+lacks.
+
+![Divergence over time](divergence.png)
+
+## Liars
+
+{fleet} robots in one room, of which 0 to 4 lie: *forger* invents a wall, *eraser* shoots rays
+through what is there, *splitter* surrounds points with copies, *wrong-frame* is half a metre and
+ten degrees off. Sums over {liar_runs} seeds. *Lost*: points of honest robots that are in the map
+without the liars' transactions and rejected with them. *Proven lost*: of the nodes that so many
+liars' misses cannot outvote, those rejected: must be 0. *Confirmed*: nodes that no honest robot
+saw, confirmed (in brackets: those far from every real surface): must be 0 while there are fewer
+liars than `witnesses`.
+
+{liars}
+
+## The bound
+
+{bound}
+"""
+
+
+def write(figures: dict[str, Any], folder: Path) -> None:
+    """Write reliability.md and its plots into the folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "reliability.md").write_text(_text(figures))
+    _save(_divergence(figures["divergence"]), folder / "divergence.png")
+    _save(_agreement(figures["loss"]), folder / "agreement.png")
+
+
+def _text(figures: dict[str, Any]) -> str:
+    sweep, options = figures["sweep"], figures["options"]
+    lossy, settings = figures["loss"], figures["settings"]
+    return TEXT.format(
+        arguments=" ".join(
+            f"--{name} {value}" for name, value in options.items() if value is not None
+        ),
+        shortened=""
+        if options["seconds"] is None
+        else f"\n**The long missions were cut to {options['seconds']:g} s, for a look.**",
+        **{name: version(name) for name in ("dagmap", "numpy", "numba")},
+        python=platform.python_version(),
+        machine=f"{platform.system()} {platform.machine()}",
+        cores=os.cpu_count(),
+        sweep=_sweep(sweep),
+        hundred=_hundred(figures["hundred"]),
+        hour_for=f"{figures['hour']['mission_s']:,.0f} s",
+        hour=_hour(figures["hour"]),
+        busy=f"{figures['busy']['messages_per_s']:,.0f} ({figures['busy']['robots']} robots)",
+        fuzz=_fuzz(figures["fuzz_executions"]),
+        scenarios=", ".join(sweep["scenarios"]),
+        seeds_each=sweep["seeds_each"],
+        runs=options["runs"],
+        loss=_loss(lossy),
+        liars=_liars(figures["liars"]),
+        liar_runs=figures["liars"][0]["runs"],
+        bound=BOUND,
+        **settings,
+    )
+
+
+def _sweep(sweep: dict[str, Any]) -> str:
+    if sweep["failure"] is not None:
+        return f"**BROKEN**: {sweep['failure']}"
+    return f"{sweep['runs']:,} runs without a violation"
+
+
+def _hundred(run: dict[str, Any]) -> str:
+    end = "one digest" if run["agreed"] else "**no agreement**"
+    over = run["bytes_received"] / max(1, run["bytes_minimum"])
+    return (
+        f"{run['robots']} robots for {run['mission_s']:,.0f} s in {run['wall_s']:,.0f} s of wall: "
+        f"{run['transactions']:,} transactions, {run['messages']:,} messages "
+        f"({run['messages_per_s']:,.0f} a second), {over:.1f} times the least bytes, {end}"
+    )
+
+
+def _hour(run: dict[str, Any]) -> str:
+    if not run["agreed"]:
+        return "**no agreement**"
+    most = max(share for _, share in run["divergence"])
+    return (
+        f"one digest {run['agreement_s']:.1f} s ({run['agreement_periods']:.1f} announcement "
+        f"periods) after it ended; until then {most:.0%} of "
+        f"{run['transactions']:,} transactions were unknown to some"
+    )
+
+
+def _fuzz(executions: int | None) -> str:
+    return "not recorded" if executions is None else f"{executions:,} ([fuzzing.md](fuzzing.md))"
+
+
+def _table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    columns = list(columns)
+    lines = [columns, ["---"] * len(columns), *map(list, rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _loss(rows: list[dict[str, Any]]) -> str:
+    columns = ["topology", "loss", "p50", "p99", "ideal", "bytes over the least", "runs"]
+    return _table(columns, map(_loss_row, rows))
+
+
+def _loss_row(row: dict[str, Any]) -> list[str]:
+    def number(name: str) -> str:
+        return "-" if row[name] is None else f"{row[name]:.3g}"
+
+    runs = f"{row['runs']}"
+    if row["apart"]:
+        runs += f" (in {row['apart']} more a robot stood apart)"
+    if row["never"]:
+        runs += f", **{row['never']} did not agree**"
+    names = [number(name) for name in ("p50", "p99", "ideal", "bytes_over_minimum")]
+    return [row["topology"], f"{row['loss']:.0%}", *names, runs]
+
+
+def _liars(rows: list[dict[str, Any]]) -> str:
+    columns = ["liars", "how many", "lost of honest points", "proven lost"]
+    columns += [f"confirmed, `witnesses` = {row}" for row in (2, 3)]
+    by = {(row["witnesses"], row["kind"], row["liars"]): row for row in rows}
+    return _table(
+        columns,
+        (
+            [
+                kind,
+                str(liars),
+                f"{by[2, kind, liars]['honest_lost']:,} of {by[2, kind, liars]['honest_points']:,}",
+                f"{by[2, kind, liars]['proven_lost']:,} of {by[2, kind, liars]['proven_nodes']:,}",
+                *(_confirmed(by[witnesses, kind, liars]) for witnesses in (2, 3)),
+            ]
+            for _, kind, liars in (key for key in by if key[0] == 2)
+        ),
+    )
+
+
+def _confirmed(row: dict[str, Any]) -> str:
+    return f"{row['liars_confirmed']:,} of {row['liars_only']:,} ({row['false_confirmed']:,})"
+
+
+def _save(figure: Figure, path: Path) -> None:
+    figure.savefig(path, dpi=80, metadata={"Software": None})
+
+
+def _divergence(run: dict[str, Any]) -> Figure:
+    figure = Figure(figsize=(8, 3), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(*zip(*run["divergence"], strict=True), color="tab:blue")
+    for i, cut in enumerate(run["partitions"]):
+        label = "partition" if i == 0 else None
+        axes.axvspan(cut["start"], cut["end"], color="tab:orange", alpha=0.25, label=label)
+    for i, crash in enumerate(run["crashes"]):
+        label = "a robot is down" if i == 0 else None
+        back = crash["at"] + crash["down"]
+        axes.axvspan(crash["at"], back, ymax=0.06, color="tab:red", label=label)
+    axes.set(xlabel="time, s", ylabel="largest share lacking", ylim=(0, None))
+    axes.legend(loc="upper right")
+    return figure
+
+
+def _agreement(rows: list[dict[str, Any]]) -> Figure:
+    figure = Figure(figsize=(8, 3), layout="constrained")
+    axes = figure.subplots()
+    for color, topology in zip(("tab:blue", "tab:orange"), _topologies(rows), strict=False):
+        of = [row for row in rows if row["topology"] == topology and row["p50"] is not None]
+        loss = [100 * row["loss"] for row in of]
+        for name, style in (("p99", "--"), ("p50", "-"), ("ideal", ":")):
+            label = f"{topology}, {name}"
+            axes.plot(loss, [row[name] for row in of], style, color=color, label=label, marker=".")
+    axes.set(xlabel="loss, %", ylabel="announcement periods", yscale="log")
+    axes.legend(fontsize="small", ncols=2)
+    return figure
+
+
+def _topologies(rows: list[dict[str, Any]]) -> list[str]:
+    return list(dict.fromkeys(row["topology"] for row in rows))
