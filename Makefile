@@ -8,6 +8,7 @@
 #   make bench        measure the speed (dagmap bench)
 #   make sweep        thousands of simulated missions with faults and liars; SEEDS=2000 for more
 #   make reliability  all figures and plots of docs/reliability.md; hours
+#   make fuzz         fuzz all that reads foreign bytes, 10^6 executions (RUNS=...); Linux, Python 3.11 on
 #   make lock         renew requirements/*.txt after a change of dependencies in pyproject.toml
 #   make clean-cache  forget compiled kernels
 #   make clean        remove all that the above have made
@@ -34,7 +35,7 @@ OFFICE := examples/office/robot1 examples/office/robot2 examples/office/robot3
 # A sourced ROS workspace sets PYTHONPATH; its packages must not mix with those of the environments.
 unexport PYTHONPATH
 
-.PHONY: demo fleet test check bench sweep reliability lock clean clean-cache
+.PHONY: demo fleet test check bench sweep reliability fuzz lock clean clean-cache
 .DELETE_ON_ERROR:
 
 demo: $(DEMO)/.package
@@ -64,6 +65,10 @@ sweep: $(TEST)/.package
 reliability: $(TEST)/.package
 	@$(TEST)/bin/python bench/reliability.py
 
+RUNS ?= 1000000
+fuzz: $(TEST)/.fuzz
+	$(TEST)/bin/python fuzz/run.py all --runs $(RUNS)
+
 # The demo installs a copy as a user would; the tests see the sources themselves.
 $(DEMO)/.package: $(DEMO)/.requirements pyproject.toml $(shell find src/dagmap -name '*.py')
 	@$(DEMO)/bin/python $(PIP) $(LOCAL) .
@@ -83,6 +88,10 @@ $(TEST)/.requirements: requirements/test.txt | $(TEST)/bin/python
 	@$(TEST)/bin/python $(PIP) --require-hashes -r $<
 	@touch $@
 
+$(TEST)/.fuzz: requirements/fuzz.txt $(TEST)/.package
+	@$(TEST)/bin/python $(PIP) --require-hashes -r $<
+	@touch $@
+
 # Debian and Ubuntu may have pip but not ensurepip: then the pip outside puts one into the environment.
 $(DEMO)/bin/python $(TEST)/bin/python $(LOCK)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] < (3, 14))' || { \
@@ -95,6 +104,7 @@ $(DEMO)/bin/python $(TEST)/bin/python $(LOCK)/bin/python:
 lock: $(LOCK)/bin/uv
 	$(COMPILE) --extra fleet --extra rgbd --extra report --output-file requirements/demo.txt
 	$(COMPILE) --extra dev --constraint requirements/demo.txt --output-file requirements/test.txt
+	$(COMPILE) --extra fuzz --constraint requirements/test.txt --output-file requirements/fuzz.txt
 	@! grep -n '://' requirements/*.txt || { echo "An address in a lock file, see above" >&2; exit 1; }
 
 $(LOCK)/bin/uv: | $(LOCK)/bin/python
@@ -102,9 +112,9 @@ $(LOCK)/bin/uv: | $(LOCK)/bin/python
 
 # numba notices a change in a kernel's own file, not in one that it calls from another file.
 clean-cache:
-	find src bench tests $(wildcard $(DEMO)) \( -name '*.nbi' -o -name '*.nbc' \) -delete
+	find src bench fuzz tests $(wildcard $(DEMO)) \( -name '*.nbi' -o -name '*.nbc' \) -delete
 
 clean: clean-cache
 	rm -rf $(DEMO) $(TEST) $(LOCK) out build dist .hypothesis .import_linter_cache .mypy_cache \
 	  .pytest_cache .ruff_cache .benchmarks
-	find src bench tests -name __pycache__ -prune -exec rm -rf {} +
+	find src bench fuzz tests -name __pycache__ -prune -exec rm -rf {} +

@@ -41,6 +41,7 @@ def bundle(author: int, points: npt.NDArray[np.int32]) -> Block | None:
         cores=np.array([n - 1], np.int64),
         sightings=np.zeros(0, np.int64),
         sighting_cycle=np.zeros(0, np.int32),
+        origin=np.zeros((n, 3), np.int32),
     )
 
 

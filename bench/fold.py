@@ -61,7 +61,7 @@ def scans(site: Site, cycles: int, seed: int = 1) -> list[Scan]:
         robot, number = cycle % ROBOTS, cycle // ROBOTS
         origin, heading = _pose(site, phase[robot], number)
         points = _seen(site, origin, heading, low, high, rng)
-        out.append(Scan(_block(robot, number, points, rng), origin.astype(np.int32)[None]))
+        out.append(Scan(_block(robot, number, points, origin, rng), origin.astype(np.int32)[None]))
     return out
 
 
@@ -103,7 +103,9 @@ def _seen(
     return np.floor(origin + ray[good] * length[good, None] + 0.5).astype(np.int32)
 
 
-def _block(robot: int, number: int, points: Int32s, rng: np.random.Generator) -> Block:
+def _block(
+    robot: int, number: int, points: Int32s, origin: npt.NDArray[Any], rng: np.random.Generator
+) -> Block:
     n = len(points)
     return Block(
         author=robot,
@@ -117,6 +119,7 @@ def _block(robot: int, number: int, points: Int32s, rng: np.random.Generator) ->
         cores=np.zeros(0, np.int64),
         sightings=np.zeros(0, np.int64),
         sighting_cycle=np.zeros(0, np.int32),
+        origin=np.tile(origin.astype(np.int32), (n, 1)),
     )
 
 

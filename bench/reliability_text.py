@@ -125,7 +125,7 @@ def _hundred(run: dict[str, Any]) -> str:
     end = "one digest" if run["agreed"] else "**no agreement**"
     over = run["bytes_received"] / max(1, run["bytes_minimum"])
     return (
-        f"{run['robots']} robots, {run['mission_s']:,.0f} s in {run['wall_s']:,.0f} s of wall time: "
+        f"{run['robots']} robots, {run['mission_s']:,.0f} s in {run['wall_s']:,.0f} s (wall): "
         f"{run['transactions']:,} transactions, {run['messages']:,} messages "
         f"({run['messages_per_s']:,.0f} a second), {over:.1f} times the least bytes, {end}"
     )

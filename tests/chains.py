@@ -2,19 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import msgspec
 import numpy as np
 
 from dagmap.config import Config, TransactionConfig
 from dagmap.identity import Identity
 from dagmap.model import quantise_pose
-from dagmap.payload import Anchor, Bundle, Payload
+from dagmap.payload import Anchor, Bundle, Payload, Revocation
 from dagmap.transaction import Transaction, parse, seal
 
 CONFIG = Config(transaction=TransactionConfig(proof_of_work_bits=0))
+FLEET_KEY = "the fleet's own key"
 
 
 def identity(name: str) -> Identity:
     return Identity.from_seed(name.encode().ljust(32, b"."))
+
+
+def closed(config: Config = CONFIG, key: str = FLEET_KEY) -> Config:
+    """The same parameters in a fleet that is closed by this key."""
+    return msgspec.structs.replace(config, fleet_key=identity(key).public_key.hex())
+
+
+def enrolled(name: str, config: Config, key: str = FLEET_KEY) -> Identity:
+    """A robot that holds a certificate of the fleet key."""
+    public_key = identity(name).public_key
+    certificate = identity(key).certify(config.fleet_id, public_key, name)
+    return Identity.from_seed(name.encode().ljust(32, b"."), certificate)
 
 
 def bundle(base: int, count: int, cycle: int = 0, parents: np.ndarray | None = None) -> Bundle:
@@ -36,7 +52,9 @@ class Author:
     """Signs whatever it is told to, keeping count like an honest robot unless told otherwise."""
 
     def __init__(self, name: str, config: Config = CONFIG) -> None:
-        self.identity, self.config = identity(name), config
+        certified = config.closed and name != FLEET_KEY
+        self.identity = enrolled(name, config) if certified else identity(name)
+        self.config = config
         self.chain: list[Transaction] = []
         self.features = 0
 
@@ -57,6 +75,8 @@ class Author:
                 anchors=(anchor(cycle),),
                 bundle=bundle(before, features, cycle) if features else None,
             )
+        if not chain:
+            payload = replace(payload, certificate=self.identity.certificate)
         previous = chain[-1] if chain else None
         known = [*references, *([previous] if previous else [])]
         time = 1 + max((tx.lamport for tx in known), default=0) if lamport is None else lamport
@@ -74,3 +94,8 @@ class Author:
         if keep and after is None:
             self.chain.append(tx)
         return tx
+
+    def revoke(self, count: int, *authors: Author, **more: object) -> Transaction:
+        """As the fleet key: of these authors the first `count` transactions count."""
+        gone = tuple(Revocation(author.identity.author, count) for author in authors)
+        return self.make(payload=Payload(revocations=gone), **more)  # type: ignore[arg-type]

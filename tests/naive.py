@@ -175,6 +175,8 @@ class Node:
     hits: Counter[int] = field(default_factory=Counter)  # default: by author
     last: dict[int, int] = field(default_factory=dict)  # default: last counted cycle by author
     authors: set[int] = field(default_factory=set)
+    seen: Counter[int] = field(default_factory=Counter)  # observations by author
+    origin: Point = (0, 0, 0)  # of the sensor that saw it first
     h: int = 0  # paper
     m: int = 0  # paper
     parents: list[int] = field(default_factory=list)  # paper
@@ -182,6 +184,7 @@ class Node:
     def observe(self, block: Block, i: int) -> None:
         self.observations.append(points(block.xyz)[i])
         self.authors.add(block.author)
+        self.seen[block.author] += 1
         if block.colored[i]:
             self.colors.append(points(block.color)[i])
 
@@ -225,7 +228,7 @@ def naive_default(config: FoldConfig, blocks: Sequence[Block]) -> NaiveMap:
             near = fold.nearest(range(len(fold.nodes)), point) if fold.nodes else None
             if near is None or near[0] > config.delta_mm**2:
                 near = (0, len(fold.nodes))
-                fold.nodes.append(Node(point))
+                fold.nodes.append(Node(point, origin=points(block.origin)[i]))
             numbers[block.base + i] = near[1]
             fold.nodes[near[1]].observe(block, i)
             fold.nodes[near[1]].hit(block.author, int(block.cycle[i]))
@@ -364,18 +367,68 @@ class NaiveRays:
             self.ends[author, cell] += sign
 
 
+def naive_log2(value: int) -> int:
+    """Sixteenths of the binary logarithm of the first nine bits: floor(16 log2)."""
+    head = value << 9 >> value.bit_length()
+    fraction = sum(head**16 >= 2 ** (8 * 16 + k) for k in range(1, 16))
+    return 16 * (value.bit_length() - 1) + fraction
+
+
+def naive_hidden(rays: NaiveRays, node: Node) -> Counter[int]:
+    """Ends by author in the cells between the sensor and a node."""
+    way = [s - o for s, o in zip(node.seed, node.origin, strict=True)]
+    square = sum(d * d for d in way)
+    length = isqrt(square - 1) + 1 if square else 0
+    cells: list[Cell] = []
+    for s in range(rays.cell, min(length - rays.cell, rays.limit), max(1, rays.cell // 2)):
+        x, y, z = (o + d * s // length for o, d in zip(node.origin, way, strict=True))
+        cell = rays.cell_of((x, y, z))
+        if cell != rays.cell_of(node.seed) and cells[-1:] != [cell]:
+            cells.append(cell)
+    return Counter({a: sum(rays.ends[a, c] for c in cells) for a in authors_of(rays)})
+
+
+def naive_misses(config: FoldConfig, fold: NaiveMap, rays: NaiveRays) -> list[int]:
+    """What counts against each node; see `dagmap.weighing`."""
+    against, support, passed, hidden = [], [], [], []
+    for node in fold.nodes:
+        cell, before = rays.cell_of(node.seed), naive_hidden(rays, node)
+        passes = {a: rays.passes[a, cell] for a in authors_of(rays)}
+        free = {a: max(0, n - rays.ends[a, cell]) for a, n in passes.items()}
+        against.append(sum(min(config.miss_say, free[a] + before[a]) for a in passes))
+        passed.append(sum(min(32, n) for n in passes.values()))
+        hidden.append(sum(min(64, n) for n in before.values()))
+        near = [n for n in fold.nodes if distance2(n.seed, node.seed) <= config.support_mm**2]
+        parts = sum((n.seen for n in near), Counter[int]())
+        support.append(sum(min(16, n) for n in parts.values()))
+    observed = sum((n.seen for n in fold.nodes), Counter[int]())
+    lonely = [n for n, s, a in zip(fold.nodes, support, against, strict=True) if s <= 1 and a > 0]
+    discredited = sum((n.seen for n in lonely), Counter[int]())
+    out = []
+    for k, node in enumerate(fold.nodes):
+        record = min(naive_log2(200 * discredited[a] // observed[a] + 1) for a in node.seen)
+        square = distance2(node.seed, node.origin)
+        length = isqrt(square - 1) + 1 if square else 1
+        balance = 6 * naive_log2(support[k])
+        balance += 6 * (naive_log2(length) - naive_log2(config.delta_mm))
+        balance -= naive_log2(1 + passed[k]) + 2 * naive_log2(1 + hidden[k])
+        balance -= 2 * record + 16 * config.doubt
+        counted = 1 if against[k] == 0 and record > 0 else against[k]
+        out.append(counted if balance <= 0 else 0)
+    return out
+
+
 def naive_verdict(
     config: FoldConfig, fold: NaiveMap, rays: NaiveRays | None
 ) -> list[tuple[int, int, int, State]]:
     """(hits, misses, witnesses, state) of every node; without rays as Algorithm 2 counts."""
     out = []
-    for node in fold.nodes:
+    misses = [0] * len(fold.nodes) if rays is None else naive_misses(config, fold, rays)
+    for node, against in zip(fold.nodes, misses, strict=True):
         h, m, witnesses = node.h, node.m, len(node.authors)
         if rays is not None:
-            cell = rays.cell_of(node.seed)
             h = sum(min(config.hit_say, hits) for hits in node.hits.values())
-            free = [rays.passes[a, cell] - rays.ends[a, cell] for a in authors_of(rays)]
-            m = sum(min(config.miss_say, max(0, f)) for f in free)
+            m = against
         state = State.CONFIRMED if witnesses >= config.witnesses else State.TENTATIVE
         out.append((h, m, witnesses, State.REJECTED if 2 * h <= h + m else state))
     return out

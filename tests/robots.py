@@ -207,7 +207,9 @@ class Robot:
 
     @property
     def log(self) -> str:
-        return (self.folder / f"{self.name}.err").read_text()
+        """What it has written to standard error so far, in all its runs."""
+        path = self.folder / f"{self.name}.err"
+        return path.read_text() if path.exists() else ""
 
     @property
     def said(self) -> str:
@@ -218,7 +220,9 @@ class Robot:
 
     def transactions(self) -> list[bytes]:
         """What the ledger of a stopped robot holds."""
-        with Store.open(self.ledger) as store:
+        if not self.ledger.exists():
+            return []
+        with Store.open(self.ledger, load_settings(self.file).config.fleet_id) as store:
             return list(store)
 
     def ids(self) -> set[bytes]:

@@ -17,13 +17,17 @@ from dagmap.evidence import RayEvidence
 from dagmap.fold import Block, Fold, NodeColumns, PaperFold, Verdict, make_fold
 from dagmap.kernels.rays import ceil_sqrt
 from dagmap.model import LIMIT_MM, State
-from naive import NaiveMap, NaiveRays, naive_default, naive_paper, naive_verdict, points
+from dagmap.weighing import log2_16
+from naive import NaiveMap, NaiveRays, naive_default, naive_log2, naive_paper, naive_verdict, points
 
 COMPILED = not numba.config.DISABLE_JIT
 SOME = settings(max_examples=100 if COMPILED else 40, deadline=None)
 FEW = settings(max_examples=40 if COMPILED else 20, deadline=None)
 SALT = 0x0123_4567_89AB_CDEF
 DEFAULT = FoldConfig(delta=0.05, cell=0.1, max_ray=1.0)
+EAGER = FoldConfig(
+    delta=0.05, cell=0.1, max_ray=1.0, doubt=1000
+)  # whatever speaks against a node counts
 PAPER = FoldConfig(preset="paper", delta=0.05)
 BOTH = pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=["default", "paper"])
 
@@ -38,6 +42,7 @@ def block(
     parents: Any = None,
     cores: Any = (),
     sightings: Any = (),
+    origin: Any = None,
 ) -> Block:
     """A block with plain columns; sightings are (number, cycle)."""
     where = np.array(xyz, np.int32).reshape(-1, 3)
@@ -54,6 +59,7 @@ def block(
         cores=np.array(cores, np.int64),
         sightings=np.array([s[0] for s in sightings], np.int64),
         sighting_cycle=np.array([s[1] for s in sightings], np.int32),
+        origin=np.zeros_like(where) if origin is None else np.array(origin, np.int32),
     )
 
 
@@ -82,6 +88,7 @@ def stories(draw: st.DrawFn, most: int = 8, size: int = 7) -> list[Block]:
             parents=parents if rng.random() < 0.9 else None,
             cores=cores,
             sightings=[(k, cycles[author] + int(rng.integers(-1, 2))) for k in again],
+            origin=xyz // 2 + rng.integers(-2000, 2000, 3) * int(rng.integers(3)) // 2,
         )
         made.cycle[:] = np.sort(cycles[author] + rng.integers(0, 2, n))
         numbers[author] = known if n else numbers[author]
@@ -234,7 +241,7 @@ def test_a_hit_counts_once_per_author_and_cycle() -> None:
 
 def test_each_author_has_a_bounded_say() -> None:
     """Two liars' rays do not outvote what three saw, nor do many hits of one author count."""
-    config = FoldConfig(delta=0.05, hit_say=1, miss_say=1)
+    config = FoldConfig(delta=0.05, hit_say=1, miss_say=1, doubt=1000)  # every miss counts
     seen = [block(a, k, [(0, 0, 0)], cycle=k) for a in (0, 1, 2) for k in range(4)]
     rays = no_rays()
     for _ in range(9):
@@ -246,9 +253,85 @@ def test_each_author_has_a_bounded_say() -> None:
     assert verdicts(applied(config, seen[:1]).evaluate(no_rays())) == [(1, 0, 1, State.TENTATIVE)]
 
 
+@given(value=st.integers(1, 1 << 31))
+@SOME
+def test_logarithms_are_whole_and_exact(value: int) -> None:
+    assert log2_16(np.array([value])).tolist() == [naive_log2(value)]
+    assert log2_16(np.array([1, 2, 3, 4, 1 << 20])).tolist() == [0, 16, 25, 32, 320]
+
+
+def lone(x: int) -> tuple[int, int, int]:
+    return (x, 50, 50)
+
+
+def seen_from_afar(author: int, base: int, xyz: Any, rays: RayEvidence) -> Block:
+    """Points seen from the origin, their rays walked too."""
+    walk(rays, author, [(0, 50, 50)], [0, len(xyz)], xyz)
+    return block(author, base, xyz, cycle=base, origin=[(0, 50, 50)] * len(xyz))
+
+
+def test_a_lone_point_falls_to_a_ray_and_a_supported_one_does_not() -> None:
+    config = FoldConfig(delta=0.03, cell=0.1, max_ray=5.0)
+    rays = RayEvidence(config.cell_mm, config.max_ray_mm)
+    wall = [(1250, 50 + 31 * y, 50 + 31 * z) for y in range(-3, 4) for z in range(-3, 4)]
+    fold = applied(config, [seen_from_afar(0, 0, [lone(1250)], rays)])
+    assert fold.evaluate(rays).states.tolist() == [State.TENTATIVE]  # nothing speaks against it
+    walk(rays, 1, [(0, 50, 50)], [0, 1], [lone(2000)])
+    assert verdicts(fold.evaluate(rays)) == [(1, 1, 1, State.REJECTED)]
+    rays = RayEvidence(config.cell_mm, config.max_ray_mm)
+    fold = applied(config, [seen_from_afar(0, 0, wall, rays)])
+    walk(rays, 1, [(0, 50, 50)], [0, 1], [lone(2000)])
+    assert set(fold.evaluate(rays).states.tolist()) == {State.TENTATIVE}
+
+
+def test_what_lies_behind_a_wall_is_not_believed() -> None:
+    config = FoldConfig(delta=0.03, cell=0.1, max_ray=5.0)
+    rays = RayEvidence(config.cell_mm, config.max_ray_mm)
+    wall = [(1050, 50 + 31 * y, 50 + 31 * z) for y in range(-3, 4) for z in range(-3, 4)]
+    fold = applied(config, [seen_from_afar(0, 0, wall, rays)])
+    fold.apply(seen_from_afar(1, 0, [lone(1450)], rays))
+    verdict = fold.evaluate(rays)
+    assert verdict.states[-1] == State.REJECTED and verdict.misses[-1] >= 1
+    assert set(verdict.states[:-1].tolist()) == {State.TENTATIVE}
+
+
+@pytest.mark.parametrize("liars", [1, 2, 3])
+def test_liars_do_not_outvote_one_honest_witness_more(liars: int) -> None:
+    """However often they walk rays through it and put walls before it."""
+    config = FoldConfig(delta=0.03, cell=0.1, max_ray=5.0)
+    rays = RayEvidence(config.cell_mm, config.max_ray_mm)
+    fold = make_fold(config, SALT)
+    for honest in range(liars + 1):
+        fold.apply(seen_from_afar(honest, 0, [lone(1250)], rays))
+    for k in range(200):
+        liar = liars + 1 + k % liars
+        walk(rays, liar, [(0, 50, 50)], [0, 1], [lone(2000)])
+        walk(rays, liar, [(0, 50, 50)], [0, 3], [lone(650), lone(750), lone(850)])
+    verdict = fold.evaluate(rays)
+    assert verdict.hits.tolist() == [liars + 1] and verdict.misses.tolist() == [liars]
+    assert verdict.states.tolist() == [State.CONFIRMED]
+
+
+def test_the_record_of_a_witness_tells_on_what_nobody_contradicts() -> None:
+    """A robot whose lone points are contradicted elsewhere is not believed about a lone point."""
+    config = FoldConfig(delta=0.03, cell=0.1, max_ray=5.0, witnesses=1)
+    rays = RayEvidence(config.cell_mm, config.max_ray_mm)
+    aside = (50, 1250, 50)
+    fold = applied(config, [block(0, 0, [aside], origin=[(0, 50, 50)])])
+    assert fold.evaluate(rays).states.tolist() == [State.CONFIRMED]
+    bad = [lone(550 + 200 * k) for k in range(6)]
+    fold.apply(block(0, 1, bad, origin=[(0, 50, 50)] * 6))
+    walk(rays, 1, [(0, 50, 50)], [0, 1], [lone(2550)])
+    verdict = fold.evaluate(rays)
+    assert verdict.states.tolist() == [State.REJECTED] * 7
+    assert verdict.misses.tolist() == [1] * 7
+    fold.apply(block(1, 0, [aside], origin=[(0, 50, 50)]))  # a reliable one has seen it too
+    assert fold.evaluate(rays).states[0] == State.CONFIRMED
+
+
 def test_support_that_ends_in_the_cell_counts_against_the_own_misses() -> None:
     rays = no_rays()
-    fold = applied(DEFAULT, [block(0, 0, [(10, 10, 10)])])
+    fold = applied(EAGER, [block(0, 0, [(10, 10, 10)])])
     walk(rays, 0, [(-150, 10, 10)], [0, 1], [(20, 20, 20)])
     walk(rays, 0, [(-150, 10, 10)], [0, 1], [(250, 10, 10)])
     assert fold.evaluate(rays).misses.tolist() == [0]  # passed once, ended once
@@ -554,6 +637,7 @@ def test_verdict_equals_its_twin(blocks: list[Block], seed: int) -> None:
         witnesses=int(rng.integers(1, 4)),
         hit_say=int(rng.integers(1, 4)),
         miss_say=int(rng.integers(0, 4)),
+        doubt=int(rng.choice([0, 10, 20, 36, 1000])),
         max_ray=0.4,
     )
     rays = RayEvidence(config.cell_mm, config.max_ray_mm, SALT)

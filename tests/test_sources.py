@@ -458,7 +458,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "version first": ({"version": np.array(9), "points": None, "cloud": 1}, "version 9"),
     "version text": ({"version": np.array("1")}, "version is"),
     "missing": ({"pose": None}, "no array pose"),
-    "unknown": ({"color": np.ones((4, 3), np.uint8)}, "unknown array color"),
+    "unknown": ({"color": np.ones((4, 3), np.uint8)}, "unknown array 'color'"),
     "no cycle": (
         {
             "stamp": np.zeros(0),

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .model import Outgoing as Outgoing
     from .model import Reason as Reason
     from .model import Rejected as Rejected
+    from .model import Revoked as Revoked
     from .model import State as State
     from .model import Waiting as Waiting
     from .worldmap import WorldMap as WorldMap
@@ -52,6 +53,7 @@ _HOME = {
         "Outgoing",
         "Reason",
         "Rejected",
+        "Revoked",
         "State",
         "Waiting",
     ),

@@ -7,19 +7,20 @@ socket, disk, chance or log in here or below.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from . import checkpoint as checkpoints
 from . import messages
 from .config import Config
 from .consensus import Consensus
-from .identity import Identity
+from .identity import Identity, certificate_holds
 from .ledger import Ledger
 from .messages import Heads, Message, Transactions
 from .model import (
     FLEET_FRAME,
     Accepted,
     AuthorId,
+    ConfigError,
     Cycle,
     Event,
     Floats,
@@ -29,6 +30,7 @@ from .model import (
     MapChanged,
     Outgoing,
     Rejected,
+    Revoked,
     TransactionId,
     Waiting,
     pose_matrix,
@@ -36,7 +38,7 @@ from .model import (
 )
 from .observing import Observing
 from .sync import Post, Sync
-from .transaction import Transaction, id_of, parse, seal
+from .transaction import Transaction, glance, id_of, parse, seal
 from .wire import Refusal
 from .worldmap import WorldMap, build_map
 
@@ -53,6 +55,7 @@ class Agent:
     """A robot's share in the fleet's map.
 
     identity: the robot's key. config: its parameters; the fleet-wide ones must be everybody's.
+    Raises ConfigError where the fleet is closed and the identity has no certificate of it.
     """
 
     def __init__(
@@ -61,6 +64,7 @@ class Agent:
         self.config = config or Config()
         self._parsers = parsers or Parsers()
         self.identity = identity
+        _check_certificate(identity, self.config)
         self.ledger = Ledger(self.config)
         self.consensus = Consensus(self.config, identity.salt)
         self.observing = Observing(self.config, identity.author, identity.salt)
@@ -119,6 +123,13 @@ class Agent:
         else:
             self._post(self.sync.asked(sender, message))
         return []
+
+    def take(self, data: bytes) -> list[Event]:
+        """Take one transaction from elsewhere than the network, as a revocation out of a file.
+
+        The others hear of it with the next announcement.
+        """
+        return self._through_the_door(bytes(data))
 
     def tick(self, now: float) -> list[Event]:
         """Let time pass: release what the pacing held back, fold, announce, repair."""
@@ -196,13 +207,16 @@ class Agent:
         """Section 4.2: seal what is valid and may go out, and take it through the door."""
         events: list[Event] = []
         me = self.identity.author
-        if self.ledger.chain(me).cut is not None:
-            return events  # the key was used twice: nothing it signs counts any more
+        own = self.ledger.chain(me)
+        if own.cut is not None or own.revoked is not None:
+            return events  # the key was used twice, or revoked: what it signs counts no more
         for payload in self.observing.payloads(now, self.ledger.features(me)):
             main = self.ledger.chain(me).main
             previous = main[-1].id if main else None
             tips = self.ledger.tips(me, self.config.transaction.max_references)
             lamport = self.ledger.lamport_after((*tips, *([previous] if previous else [])))
+            if self.config.closed and previous is None:
+                payload = replace(payload, certificate=self.identity.certificate)
             data = seal(self.identity, self.config, len(main), previous, lamport, tips, payload)
             bundles = 0 if payload.bundle is None else len(payload.bundle.cores())
             events += self._through_the_door(data)
@@ -214,9 +228,14 @@ class Agent:
 
     def _through_the_door(self, data: bytes, again: bool = False) -> list[Event]:
         """The one door: own and foreign transactions alike are judged, kept and folded."""
-        if self.ledger.holds(id_of(data)):
+        id_ = id_of(data)
+        if self.ledger.holds(id_):
             return []
         try:
+            if self.config.closed and not again:
+                author, previous = glance(data)
+                if previous and not self.ledger.worth_judging(id_, author):
+                    return [Waiting(id_, (previous,))]
             transaction = self._parsers.transaction(data, self.config)
         except Refusal as refusal:
             return [Rejected(refusal.reason, refusal.fault, refusal.detail)]
@@ -227,6 +246,9 @@ class Agent:
             events.append(Forked(author, sequence))
             proof = self.ledger.chain(author).proof or ()  # kept like what was accepted
             events += [Accepted(tx.id, tx.data) for tx in proof if tx.id not in self.ledger]
+        for author, count in outcome.revoked:
+            self._refold(author)
+            events.append(Revoked(author, count))
         for tx in outcome.accepted:
             self._fold(tx)
             events.append(Accepted(tx.id, tx.data))
@@ -236,10 +258,22 @@ class Agent:
         return events
 
     def _fold(self, tx: Transaction) -> None:
+        if tx in self.consensus or tx.payload.revocations:
+            return
         if self.ledger.counts(tx):
             self.consensus.add(tx)
         else:
             tx.drop_columns()
+        self._map = None
+
+    def _refold(self, author: AuthorId) -> None:
+        """A revocation came, or counts no more: fold exactly what counts of the author now."""
+        chain = self.ledger.chain(author)
+        self.consensus.cut(author, chain.end)
+        for tx in chain.main[: chain.end]:
+            if tx not in self.consensus and self.ledger.counts(tx):
+                tx.payload = tx.decode_again(self.config)
+                self.consensus.add(tx)
         self._map = None
 
     def _advance(self, budget: int | None = None) -> list[Event]:
@@ -252,3 +286,29 @@ class Agent:
         me = self.identity.author
         for message, to in posts:
             self._outbox.append(Outgoing(messages.encode(message, self.config, me), to))
+
+
+def _check_certificate(identity: Identity, config: Config) -> None:
+    """In a closed fleet a robot without its certificate would be heard by nobody."""
+    certificate, remedy = identity.certificate, "enroll the robot (dagmap keys enroll)"
+    if not config.closed:
+        return
+    if certificate is None:
+        raise ConfigError(
+            f"Config: fleet_key closes the fleet {config.fleet!r}, but {identity} has no "
+            f"certificate; {remedy} and load its folder"
+        )
+    holds = certificate_holds(
+        certificate, config.fleet_public_key, config.fleet_id, identity.public_key
+    )
+    if not holds:
+        raise ConfigError(
+            f"Config: the certificate of {identity} is not one of the fleet {config.fleet!r} with "
+            f"fleet_key = {config.fleet_key!r}; {remedy} in that fleet, or correct both keys"
+        )
+    name = identity.name
+    if config.name not in ("", name):
+        raise ConfigError(
+            f"Config: name = {config.name!r}, but the certificate names the robot {name!r}; "
+            "leave the name out"
+        )

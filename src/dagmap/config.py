@@ -7,12 +7,13 @@ are what the integer core uses.
 from __future__ import annotations
 
 import hashlib
+import re
 from pathlib import Path
 from typing import Literal, TypeVar
 
 import msgspec
 
-from .model import LIMIT_MM, ConfigError, CycleError, quantise_pose
+from .model import LIMIT_MM, MAX_NAME, ConfigError, CycleError, quantise_pose
 
 
 class _Checked(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -35,7 +36,7 @@ class GraphConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     n_p: int = 2  # N_p, parents of a node at most
     n_c: int = 2  # N_c, children at which a node leaves the terminals; the start value
     n_c_max: int = 8  # the bound within which the controller moves N_c
-    v_th: int = 3  # V_th: a node whose validity exceeds it becomes the core of a bundle
+    v_th: int = 1  # V_th: a node whose validity exceeds it becomes the core of a bundle
     reference_pitch: float = 0.05  # m, of the lattice of reference nodes
     max_parent_distance: float | None = 0.15  # m; None: parents may be any distance away
     issued_validity: Literal["inherit", "reset"] = "inherit"
@@ -96,10 +97,11 @@ class FoldConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True
     """Section 4.3: the map consensus. All of it is fleet-wide."""
 
     preset: Literal["default", "paper"] = "default"
-    delta: float = 0.05  # m: observations within it are twins (Algorithm 2's delta)
+    delta: float = 0.03  # m: observations within it are twins (Algorithm 2's delta)
     witnesses: int = 2  # authors that a confirmed node needs
-    hit_say: int = 2  # what one author's hits count for in one node, at most
+    hit_say: int = 1  # what one author's hits count for in one node, at most
     miss_say: int = 1  # what one author's misses count for in one node, at most
+    doubt: int = 36  # what speaks for a node must outweigh it, or misses count; see `weighing`
     cell: float = 0.10  # m: cell of the ray evidence
     max_ray: float = 5.0  # m: a ray is walked so far from its sensor
 
@@ -108,6 +110,7 @@ class FoldConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True
         self._require_range("witnesses", 1, 1000)
         self._require_range("hit_say", 1, 1000)
         self._require_range("miss_say", 0, 1000)
+        self._require_range("doubt", 0, 1000)
         self._require_range("cell", 0.005, 10.0)
         self._require_range("max_ray", 0.0, 100.0)
         self._require(
@@ -117,6 +120,11 @@ class FoldConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True
     @property
     def delta_mm(self) -> int:
         return round(self.delta * 1000)
+
+    @property
+    def support_mm(self) -> int:
+        """What lies so near to a node supports it, mm: two and a half delta."""
+        return 5 * self.delta_mm // 2
 
     @property
     def cell_mm(self) -> int:
@@ -157,13 +165,18 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All parameters of one participant.
 
     fleet: name of the fleet. Its hash, with that of the fleet-wide parameters, heads every message.
-    name: what people call this robot; empty: the hexadecimal author id.
+    fleet_key: the fleet's public key, 64 hexadecimal digits (`dagmap keys` makes it). With it the
+        fleet is closed: only robots that hold a certificate of this key take part. Empty: an open
+        fleet, where any key may sign, for a first try.
+    name: what people call this robot; empty: the hexadecimal author id. In a closed fleet the
+        certificate names it.
     start_pose: (4, 4) rows of the robot's first SLAM frame in the fleet frame, metres, published as
         a link; default identity: the robots share one frame. None: unknown.
     same_origin: whether a new session of the SLAM starts in the frame of the one before.
     """
 
     fleet: str = "dagmap"
+    fleet_key: str = ""
     name: str = ""
     start_pose: tuple[tuple[float, float, float, float], ...] | None = (
         (1.0, 0.0, 0.0, 0.0),
@@ -180,8 +193,14 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     sync: SyncConfig = SyncConfig()
 
     def __post_init__(self) -> None:
-        self._require(len(self.name.encode()) <= 64, "name", "at most 64 bytes of UTF-8 are wanted")
+        fits = len(self.name.encode()) <= MAX_NAME
+        self._require(fits, "name", f"at most {MAX_NAME} bytes of UTF-8 are wanted")
         self._require(self.name.isprintable(), "name", "printable characters are wanted")
+        self._require(
+            not self.fleet_key or re.fullmatch("[0-9a-f]{64}", self.fleet_key) is not None,
+            "fleet_key",
+            "the 64 lower case hexadecimal digits are wanted that stand in the fleet's fleet.toml",
+        )
         if self.start_pose is not None:
             try:
                 quantise_pose(self.start_pose, "Config: start_pose")
@@ -190,8 +209,21 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     @property
     def fleet_id(self) -> bytes:
-        """8 bytes that name the fleet."""
-        return hashlib.blake2b(b"dagmap fleet 1\0" + self.fleet.encode(), digest_size=8).digest()
+        """8 bytes that name the fleet: a closed one by its key and its name."""
+        named = b"dagmap fleet 1\0" + self.fleet.encode()
+        if self.closed:
+            named = b"dagmap closed fleet 1\0" + self.fleet_public_key + self.fleet.encode()
+        return hashlib.blake2b(named, digest_size=8).digest()
+
+    @property
+    def closed(self) -> bool:
+        """Whether only robots with a certificate of the fleet key take part."""
+        return bool(self.fleet_key)
+
+    @property
+    def fleet_public_key(self) -> bytes:
+        """The 32 bytes of the fleet key; none in an open fleet."""
+        return bytes.fromhex(self.fleet_key)
 
     @property
     def parameters_id(self) -> bytes:
@@ -219,3 +251,5 @@ def load_config(path: Path, kind: type[C] = Config) -> C:  # type: ignore[assign
         raise ConfigError(f"{path}: {error}") from None
     except msgspec.DecodeError as error:
         raise ConfigError(f"{path}: not valid TOML ({error})") from None
+    except (ValueError, RecursionError):  # Python's own limits, which its TOML reader lets through
+        raise ConfigError(f"{path}: a number is too long or something nested too deep") from None

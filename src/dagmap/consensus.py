@@ -64,6 +64,9 @@ class Consensus:
         """All of them, in canonical order."""
         return (self._contributions[key] for key in self._order)
 
+    def __contains__(self, tx: Transaction) -> bool:
+        return tx.key in self._contributions
+
     def add(self, tx: Transaction) -> None:
         """Take a transaction that counts. Per author they come in sequence."""
         contribution = Contribution(tx, self.author(tx.author), self._config)
@@ -74,7 +77,7 @@ class Consensus:
         tx.drop_columns()
 
     def cut(self, id_: AuthorId, sequence: int) -> None:
-        """Leave out everything of an author from `sequence` on: a fork was proven there."""
+        """Leave out everything of an author from `sequence` on: a fork, or a revocation."""
         mine = [key for key in self._order if key[1] == id_]
         gone = [key for key in mine if key[2] >= sequence]
         if not gone:
@@ -172,7 +175,7 @@ class Consensus:
             if link.source.author == tx.author and room:  # a robot places its own frames only
                 author.links[ends] = link
                 self._links_changed = True
-        author.name = author.name if tx.payload.name is None else tx.payload.name
+        author.name = author.name if tx.payload.robot is None else tx.payload.robot
 
     def _update_frames(self) -> None:
         before = self.frames

@@ -155,6 +155,7 @@ class Contribution:
             cores=self.cores,
             sightings=numbers,
             sighting_cycle=cycles,
+            origin=part.origins.repeat(self.starts[1:] - self.starts[:-1], axis=0),
         )
 
     def alive(self, part: Part) -> Bools:

@@ -136,23 +136,15 @@ class RayEvidence:
         return passes, ends
 
     def judge(
-        self, say: tuple[int, int], seed: Int32s, first: Int32s, entries: Int32s
-    ) -> tuple[Int32s, Int32s, Int32s]:
-        """Hits, misses and witnesses (N,) of nodes, without arrays of (N, A); see `fold`."""
-        hits, misses, witnesses = (np.zeros(len(seed), np.int32) for _ in range(3))
-        bricks.judge(
-            self._bricks,
-            self._cell,
-            say[0],
-            say[1],
-            seed,
-            first,
-            entries,
-            hits,
-            misses,
-            witnesses,
-        )
-        return hits, misses, witnesses
+        self, say: Int64s, seed: Int32s, origin: Int32s, first: Int32s, entries: Int32s
+    ) -> Int32s:
+        """(N, 6) hits, witnesses, against, distance, passed and hidden of nodes, without arrays of
+        (N, A); see `kernels.bricks.judge`."""
+        out = np.zeros((len(seed), 6), np.int32)
+        part, touched = np.zeros((self._authors, 4), np.int32), np.zeros(self._authors, np.int32)
+        held, cell, limit = self._bricks, self._cell, self._limit
+        bricks.judge(held, cell, limit, say, seed, origin, first, entries, part, touched, out)
+        return out
 
     def _add(self, author: int, sign: int) -> None:
         """Add what is marked to the counters of an author."""

@@ -13,6 +13,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from . import weighing
 from .config import FoldConfig
 from .evidence import RayEvidence, hash_key, plain, with_room
 from .kernels import algorithm2, matching
@@ -30,6 +31,7 @@ __all__ = [
 ]
 
 D = TypeVar("D", bound=np.generic)
+_SAY = (16, 32, 64)  # of one author: observations around, passes through, ends before a node
 
 
 @dataclass(slots=True, eq=False)
@@ -47,6 +49,7 @@ class Block:
     cores: Int64s  # (k,) indices of the bundles' cores, in order; only Algorithm 2 needs them
     sightings: Int64s  # (s,) the author's numbers of features seen again: evidence only
     sighting_cycle: Int32s  # (s,)
+    origin: Int32s  # (n, 3) mm, where the sensor was that saw the feature
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,6 +177,7 @@ class DefaultFold:
         self._config, self._reach = config, config.delta_mm
         self._shift = max(1, (2 * self._reach - 1).bit_length())  # cells of at least 2 delta
         self._features = _Features()
+        self._authors = 0
         self._nodes = matching.Nodes(
             sizes=np.zeros(2, np.int64),
             key=hash_key(salt),
@@ -184,7 +188,8 @@ class DefaultFold:
             color=np.zeros((0, 3), np.int64),
             color_count=np.zeros(0, np.int32),
             first=np.zeros(0, np.int32),
-            entries=np.zeros((0, 4), np.int32),
+            entries=np.zeros((0, 5), np.int32),
+            origin=np.zeros((0, 3), np.int32),
         )
 
     def __len__(self) -> int:
@@ -192,6 +197,7 @@ class DefaultFold:
 
     def apply(self, block: Block) -> None:
         self._make_room(len(block.xyz), len(block.sightings))
+        self._authors = max(self._authors, block.author + 1)
         base, features, undo = self._features.open(block)
         matching.apply(
             self._nodes, self._shift, self._reach, block.author, _seen(block), base, features, undo
@@ -209,10 +215,39 @@ class DefaultFold:
         return _columns(self._nodes, len(self))
 
     def evaluate(self, rays: RayEvidence) -> Verdict:
-        say = (self._config.hit_say, self._config.miss_say)
-        nodes, n = self._nodes, len(self)
-        counted = rays.judge(say, nodes.seed[:n], nodes.first, nodes.entries)
-        return _verdict(*counted, self._config.witnesses)
+        config, n = self._config, len(self)
+        found = self._gather(rays, n)
+        record = self._records(weighing.lonely(found))
+        misses = weighing.misses(found, record, config.delta_mm, config.doubt)
+        return _verdict(found.hits, misses, found.witnesses, config.witnesses)
+
+    def _gather(self, rays: RayEvidence, n: int) -> weighing.Evidence:
+        """What is seen around every node, and what the rays say of it."""
+        nodes, authors = self._nodes, self._authors
+        part, touched = np.zeros(authors, np.int32), np.zeros(authors, np.int32)
+        support, reach = np.zeros(n, np.int32), self._config.support_mm
+        matching.support(nodes, self._shift, reach, _SAY[0], part, touched, support)
+        say = np.array([self._config.hit_say, self._config.miss_say, *_SAY[1:]], np.int64)
+        said = rays.judge(say, nodes.seed[:n], nodes.origin, nodes.first, nodes.entries)
+        hits, witnesses, against, distance, passed, hidden = (plain(c) for c in said.T)
+        return weighing.Evidence(hits, witnesses, against, support, distance, passed, hidden)
+
+    def _records(self, lonely: Bools) -> Int64s:
+        """(N,) the record of the most reliable of each node's witnesses."""
+        nodes, authors = self._nodes, self._authors
+        entries = nodes.entries[: int(nodes.sizes[matching.ENTRIES])]
+        observed, discredited = np.zeros(authors, np.int64), np.zeros(authors, np.int64)
+        np.add.at(observed, entries[:, matching.AUTHOR], entries[:, matching.SEEN])
+        alone = entries[nodes.first[: len(lonely)][lonely], matching.AUTHOR]
+        np.add.at(discredited, alone, 1)
+        record = weighing.records(discredited, observed)
+        best = np.full(len(lonely), np.iinfo(np.int64).max)
+        rows, at = np.arange(len(lonely)), nodes.first[: len(lonely)]
+        while len(rows):
+            best[rows] = np.minimum(best[rows], record[entries[at, matching.AUTHOR]])
+            at = entries[at, matching.NEXT]
+            rows, at = rows[at >= 0], at[at >= 0]
+        return best
 
     @property
     def nbytes(self) -> int:
@@ -230,6 +265,7 @@ class DefaultFold:
                 color_count=with_room(held.color_count, nodes),
                 first=with_room(held.first, nodes),
                 entries=with_room(held.entries, entries),
+                origin=with_room(held.origin, nodes),
             )
         if nodes > len(held.buckets):
             held = held._replace(buckets=np.full(1 << nodes.bit_length(), -1, np.int32))
@@ -352,6 +388,7 @@ def _seen(block: Block) -> matching.Seen:
         plain(block.colored),
         plain(block.sightings),
         plain(block.sighting_cycle),
+        plain(block.origin),
     )
 
 

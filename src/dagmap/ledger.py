@@ -4,7 +4,9 @@ What is accepted is decided by the transaction and by what it refers to, never b
   - it waits until everything it refers to is known;
   - it continues its author's chain: previous id, sequence, feature count, Lamport time;
   - two transactions of one author with one number prove a fork. The lowest such number is the
-    author's cut: from it on nothing of the author counts, whichever branch a robot saw first.
+    author's cut: from it on nothing of the author counts, whichever branch a robot saw first;
+  - what the fleet key has revoked counts as little. Its revocations count like transactions: those
+    of its chain, up to its own cut.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .config import Config
+from .identity import author_of
 from .model import AuthorId, Reason, TransactionId, Uint8s
 from .transaction import Transaction
 from .wire import Refusal
@@ -28,13 +31,21 @@ class Chain:
 
     main: list[Transaction] = field(default_factory=list)
     cut: int | None = None
+    revoked: int | None = None
     proof: tuple[Transaction, Transaction] | None = None
     children: Uint8s = field(default_factory=lambda: np.zeros(0, np.uint8))  # of issued features
 
     @property
+    def limit(self) -> int | None:
+        """The number from which on nothing counts: the cut, or where the author was revoked."""
+        if self.cut is None or self.revoked is None:
+            return self.cut if self.revoked is None else self.revoked
+        return min(self.cut, self.revoked)
+
+    @property
     def end(self) -> int:
-        """The first number that does not count: the chain's length, or the cut."""
-        return len(self.main) if self.cut is None else min(self.cut, len(self.main))
+        """The first number that does not count: the chain's length, or the limit."""
+        return len(self.main) if self.limit is None else min(self.limit, len(self.main))
 
 
 @dataclass(slots=True)
@@ -44,6 +55,7 @@ class Outcome:
     accepted: list[Transaction] = field(default_factory=list)
     refused: list[Refusal] = field(default_factory=list)
     forked: list[tuple[AuthorId, int]] = field(default_factory=list)
+    revoked: list[tuple[AuthorId, int | None]] = field(default_factory=list)  # None: not any more
     missing: tuple[TransactionId, ...] | None = None  # the transaction waits for these
 
 
@@ -71,6 +83,8 @@ class Ledger:
         self._waiting_size = 0
         self._tips: set[TransactionId] = set()
         self._overfull: set[TransactionId] = set()  # kept, but never folded
+        self._fleet = author_of(config.fleet_public_key) if config.closed else None
+        self._certified = set() if self._fleet is None else {self._fleet}
 
     def __len__(self) -> int:
         return len(self._known)
@@ -107,9 +121,22 @@ class Ledger:
         return next((tx for pair in proofs for tx in pair if tx.id == id_), None)
 
     def counts(self, tx: Transaction) -> bool:
-        """Whether an accepted transaction lies before its author's cut, if there is one."""
-        cut = self.chain(tx.author).cut
-        return (cut is None or tx.sequence < cut) and tx.id not in self._overfull
+        """Whether an accepted transaction lies before its author's limit, if there is one."""
+        limit = self.chain(tx.author).limit
+        return (limit is None or tx.sequence < limit) and tx.id not in self._overfull
+
+    def certified(self, author: AuthorId) -> bool:
+        """Whether the fleet is open, or a certificate of the author has been seen."""
+        return self._fleet is None or author in self._certified
+
+    def worth_judging(self, id_: TransactionId, author: AuthorId) -> bool:
+        """Whether a transaction that is not its author's first is to be looked at yet.
+
+        In a closed fleet a stranger's is not: no certificate of the author was seen, and no
+        certified robot refers to it. Such a one is not refused either: sync asks for it again once
+        the author's first transaction is here.
+        """
+        return self.certified(author) or id_ in self._waited_for
 
     def features(self, author: AuthorId) -> int:
         """How many features the author's chain has issued."""
@@ -131,7 +158,9 @@ class Ledger:
         """Ids to ask for: what waiting transactions lack, and where a proven fork begins lower."""
         lacking = [id_ for id_ in self._waited_for if not self.holds(id_)]
         for chain in self.chains.values():
-            if chain.proof is not None and chain.proof[0].previous != chain.proof[1].previous:
+            if chain.proof is None or chain.limit != chain.cut:
+                continue  # revoked before its fork: where exactly it forked makes no difference
+            if chain.proof[0].previous != chain.proof[1].previous:
                 before = (tx.previous for tx in chain.proof if tx.previous is not None)
                 lacking.extend(id_ for id_ in before if not self.holds(id_))
         return tuple(dict.fromkeys(lacking))
@@ -151,6 +180,8 @@ class Ledger:
             tx = queue.pop(0)
             if self.holds(tx.id):
                 continue
+            if tx.sequence == 0 and self._fleet is not None:
+                self._certified.add(tx.author)  # as many as the fleet key has enrolled
             self._note_fork(tx, outcome)
             refusal = self._admit(tx, outcome, first=tx is transaction, again=again)
             if refusal is not None:
@@ -158,17 +189,21 @@ class Ledger:
             elif tx.id in self._known:
                 outcome.accepted.append(tx)
                 queue.extend(self._released_by(tx.id))
+            if tx.author == self._fleet:
+                self._count_revocations(outcome)
         return outcome
 
     def _admit(self, tx: Transaction, outcome: Outcome, first: bool, again: bool) -> Refusal | None:
-        """Accept, keep waiting, or refuse. Beyond a cut only what others refer to is accepted."""
+        """Accept, keep waiting, or refuse. Beyond a limit only what others refer to is accepted."""
         chain = self.chain(tx.author)
-        beyond = chain.cut is not None and tx.sequence >= chain.cut
+        limit = chain.limit
+        beyond = limit is not None and tx.sequence >= limit
         if beyond and not again and tx.id not in self._waited_for:
             proof = chain.proof or ()
             if any(tx.id == kept.id for kept in proof):
                 return None
-            return Refusal(Reason.FORK, f"sequence {tx.sequence}, cut {chain.cut}", tx.author)
+            reason = Reason.FORK if limit == chain.cut else Reason.REVOKED
+            return Refusal(reason, f"sequence {tx.sequence}, limit {limit}", tx.author)
         missing = tuple(dict.fromkeys(id_ for id_ in tx.refers_to if id_ not in self._known))
         if missing:
             self._wait(tx, missing)
@@ -236,6 +271,22 @@ class Ledger:
             return False
         chain.children[numbers] = total
         return True
+
+    def _count_revocations(self, outcome: Outcome) -> None:
+        """Judge anew who is revoked from where on, by what counts of the fleet key's chain."""
+        assert self._fleet is not None
+        counts: dict[AuthorId, int] = {}
+        fleet = self.chain(self._fleet)
+        for tx in fleet.main[: fleet.end]:
+            for gone in tx.payload.revocations:
+                counts[gone.author] = min(gone.count, counts.get(gone.author, gone.count))
+        for author in counts:
+            self.chains.setdefault(author, Chain())
+        for author, chain in self.chains.items():
+            if chain.revoked != counts.get(author):
+                chain.revoked = counts.get(author)
+                outcome.revoked.append((author, chain.revoked))
+                self.changed.add(author)
 
     def _note_fork(self, tx: Transaction, outcome: Outcome) -> None:
         """Two self-valid transactions with one number are the proof, whatever else is known."""

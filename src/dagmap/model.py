@@ -23,6 +23,7 @@ Bools: TypeAlias = npt.NDArray[np.bool_]
 LIMIT_MM = 1 << 29  # coordinates lie within +-LIMIT_MM before and after every pose
 QUATERNION_ONE = 1 << 30
 MAX_CYCLE = (1 << 31) - 1
+MAX_NAME = 64  # bytes of a robot's name
 FLEET_FRAME: FrameId  # defined below
 
 
@@ -48,6 +49,10 @@ class OutputError(DagmapError):
 
 class StoreError(DagmapError):
     """A ledger on disk cannot be opened, read or written."""
+
+
+class KeysError(DagmapError):
+    """A key, a certificate or the folder of a fleet cannot be made, read or trusted."""
 
 
 class NetworkError(DagmapError):
@@ -156,7 +161,8 @@ def quantise_points(points: npt.ArrayLike, where: str = "points") -> Int32s:
         return np.zeros((0, 3), np.int32)
     if metres.ndim != 2 or metres.shape[1] != 3:
         raise CycleError(f"{where}: the shape is {metres.shape}; (N, 3) is wanted")
-    millimetres = np.floor(metres * 1000.0 + 0.5)
+    with np.errstate(over="ignore"):  # to infinity, which is refused
+        millimetres = np.floor(metres * 1000.0 + 0.5)
     bad = np.asarray(~(np.abs(millimetres) <= LIMIT_MM).all(axis=1))  # catches NaN too
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
@@ -179,7 +185,9 @@ def quantise_pose(pose: npt.ArrayLike, where: str = "pose") -> Int32s:
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise CycleError(f"{where}: a finite (4, 4) matrix is wanted, this is {matrix.tolist()}")
     rotation = matrix[:3, :3]
-    rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 and np.linalg.det(rotation) > 0
+    with np.errstate(over="ignore", invalid="ignore"):  # to infinity or NaN, which is not rigid
+        orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3
+    rigid = orthonormal and np.linalg.det(rotation) > 0
     if not rigid or np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
         raise CycleError(
             f"{where}: not a rigid motion (rotation must be orthonormal with determinant 1, "
@@ -284,11 +292,13 @@ class Reason(Enum):
     PARAMETERS = "other fold parameters"
     MALFORMED = "malformed"
     PROOF_OF_WORK = "proof of work missing"
+    CERTIFICATE = "no certificate of this fleet"
     SIGNATURE = "signature does not match"
     CHAIN = "does not continue its author's chain"
     LAMPORT = "Lamport time does not follow from its references"
     STRUCTURE = "graph structure violated"
     FORK = "beyond a proven fork of its author"
+    REVOKED = "beyond the revocation of its author"
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,7 +320,11 @@ class Rejected:
 
 @dataclass(frozen=True, slots=True)
 class Waiting:
-    """A transaction is kept aside until what it refers to is known."""
+    """A transaction is kept aside until what it refers to is known.
+
+    In a closed fleet it is not even kept where nothing certified is known of its author: it comes
+    again once the author's first transaction is here.
+    """
 
     id: TransactionId
     missing: tuple[TransactionId, ...]
@@ -335,6 +349,17 @@ class Forked:
 
 
 @dataclass(frozen=True, slots=True)
+class Revoked:
+    """The fleet key has revoked an author: its first `count` transactions count, no others.
+
+    count: None where the revocation does not count any more, since the fleet key itself has forked.
+    """
+
+    author: AuthorId
+    count: int | None
+
+
+@dataclass(frozen=True, slots=True)
 class MapChanged:
     """The fold has moved: so many transactions were undone and applied."""
 
@@ -342,7 +367,7 @@ class MapChanged:
     applied: int
 
 
-Event: TypeAlias = Accepted | Rejected | Waiting | Issued | Forked | MapChanged
+Event: TypeAlias = Accepted | Rejected | Waiting | Issued | Forked | Revoked | MapChanged
 
 
 @dataclass(frozen=True, slots=True)

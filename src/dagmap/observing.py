@@ -48,7 +48,7 @@ class Observing:
         self._moved = False
         self._retracted: list[Int64s] = []
         self._links: list[Link] = []
-        self._introduced = False
+        self._introduced = config.closed  # there the certificate names the robot
         self._earlier: list[Issuance] = []  # of former sessions, with features held back
         self._start_frame()
 

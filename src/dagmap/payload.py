@@ -16,7 +16,9 @@ from .kernels.codec import decode_features, encode_features
 from .model import (
     LIMIT_MM,
     MAX_CYCLE,
+    MAX_NAME,
     QUATERNION_ONE,
+    AuthorId,
     FrameId,
     Int32s,
     Int64s,
@@ -27,6 +29,7 @@ from .wire import Reader, Refusal
 
 MAX_FEATURES = 4096  # of one bundle record; bounds the work that foreign bytes can ask for
 MAX_NUMBER = (1 << 40) - 1  # of an author's features
+MAX_SEQUENCE = (1 << 40) - 1  # of an author's transactions
 _MAX_LIST = 1 << 16
 _NORM_SLACK = 1 << 50  # of a quaternion's squared norm 2^60: a thousandth
 
@@ -40,6 +43,8 @@ class Kind(IntEnum):
     RETRACTION = 4
     SIGHTING = 5
     LINK = 6
+    CERTIFICATE = 7
+    REVOCATION = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,6 +99,14 @@ class Link:
     inliers: int
 
 
+@dataclass(frozen=True, slots=True)
+class Revocation:
+    """The fleet key's word on a robot: its first `count` transactions count, no others."""
+
+    author: AuthorId
+    count: int
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Payload:
     """The records of one transaction, by kind."""
@@ -104,6 +117,13 @@ class Payload:
     retracted: Int64s = field(default_factory=lambda: np.zeros(0, np.int64))  # ascending numbers
     sightings: tuple[Sighting, ...] = ()
     links: tuple[Link, ...] = ()
+    certificate: bytes | None = None  # name, then 64 bytes of signature: see identity.py
+    revocations: tuple[Revocation, ...] = ()
+
+    @property
+    def robot(self) -> str | None:
+        """What the author is called: by its certificate, else by its own word."""
+        return self.name if self.certificate is None else self.certificate[:-64].decode()
 
     @property
     def features(self) -> int:
@@ -113,6 +133,8 @@ class Payload:
 def encode_payload(payload: Payload) -> bytes:
     """The canonical bytes of a payload; `decode_payload` is the inverse."""
     records: list[tuple[Kind, bytes]] = []
+    if payload.certificate is not None:  # first, so that it is found before the rest is read
+        records.append((Kind.CERTIFICATE, payload.certificate))
     if payload.name is not None:
         records.append((Kind.PROFILE, payload.name.encode()))
     if payload.anchors:
@@ -125,6 +147,8 @@ def encode_payload(payload: Payload) -> bytes:
         body = wire.number(sighting.cycle) + _encode_ascending(sighting.numbers)
         records.append((Kind.SIGHTING, body))
     records.extend((Kind.LINK, _encode_link(link)) for link in payload.links)
+    for gone in payload.revocations:
+        records.append((Kind.REVOCATION, gone.author + wire.number(gone.count)))
     return b"".join(wire.number(kind) + wire.number(len(body)) + body for kind, body in records)
 
 
@@ -137,13 +161,14 @@ def decode_payload(data: bytes, n_p: int) -> Payload:
         body = Reader(reader.take(size))
         if kind in found:
             found[Kind(kind)].append(body)
-    for kind in (Kind.PROFILE, Kind.ANCHORS, Kind.BUNDLE, Kind.RETRACTION):
+    for kind in (Kind.PROFILE, Kind.ANCHORS, Kind.BUNDLE, Kind.RETRACTION, Kind.CERTIFICATE):
         if len(found[kind]) > 1:
             raise Refusal(Reason.MALFORMED, f"two records of kind {kind.name}")
     names = [_decode_name(body) for body in found[Kind.PROFILE]]
     anchors = [anchor for body in found[Kind.ANCHORS] for anchor in _decode_anchors(body)]
     bundles = [_decode_bundle(body, n_p) for body in found[Kind.BUNDLE]]
     retracted = [_whole(body, _decode_ascending) for body in found[Kind.RETRACTION]]
+    certificates = [_decode_certificate(body) for body in found[Kind.CERTIFICATE]]
     return Payload(
         names[0] if names else None,
         tuple(anchors),
@@ -151,11 +176,37 @@ def decode_payload(data: bytes, n_p: int) -> Payload:
         retracted[0] if retracted else np.zeros(0, np.int64),
         tuple(_decode_sighting(body) for body in found[Kind.SIGHTING]),
         tuple(_decode_link(body) for body in found[Kind.LINK]),
+        certificates[0] if certificates else None,
+        tuple(_decode_revocation(body) for body in found[Kind.REVOCATION]),
     )
 
 
+def first_certificate(data: bytes) -> bytes:
+    """The certificate with which these records begin; nothing behind it is read.
+
+    Raises Refusal where the first record is another, or none.
+    """
+    reader = Reader(data)
+    if not reader.left or reader.number() != Kind.CERTIFICATE:
+        raise Refusal(Reason.CERTIFICATE, "the first record is none")
+    return reader.take(reader.number(MAX_NAME + 64))
+
+
+def _decode_certificate(body: Reader) -> bytes:
+    if body.left <= 64:
+        raise Refusal(Reason.MALFORMED, "certificate without a name")
+    _decode_name(Reader(body.data[:-64]))
+    return body.data
+
+
+def _decode_revocation(body: Reader) -> Revocation:
+    revocation = Revocation(body.take(8), body.number(MAX_SEQUENCE + 1))
+    body.end()
+    return revocation
+
+
 def _decode_name(body: Reader) -> str:
-    if body.left > 64:
+    if body.left > MAX_NAME:
         raise Refusal(Reason.MALFORMED, "name longer than 64 bytes")
     try:
         name = body.take(body.left).decode()

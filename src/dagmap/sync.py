@@ -181,9 +181,11 @@ class Sync:
         return self._proves(head) or self._wanted(head, waiting) is not None
 
     def _proves(self, head: Head) -> bool:
-        """Whether a head announces a fork that is not known here."""
+        """Whether a head announces a fork that is not known here, and could be judged."""
+        if head.cut is None or not (head.cut == 0 or self._ledger.certified(head.author)):
+            return False
         cut = self._ledger.chain(head.author).cut
-        return head.cut is not None and (cut is None or head.cut < cut)
+        return cut is None or head.cut < cut
 
     def _wanted(self, head: Head, waiting: dict[AuthorId, int]) -> tuple[int, int] | None:
         """The range of an author's chain that a head promises and that is lacking here."""
@@ -191,9 +193,9 @@ class Sync:
         mine = len(chain.main)
         if 0 < head.length <= mine:
             differs = _tip(chain.main[head.length - 1].id) != head.tip
-            counts = chain.cut is None or head.length <= chain.cut
+            counts = chain.limit is None or head.length <= chain.limit
             return (head.length - 1, head.length) if differs and counts else None
-        end = head.length if chain.cut is None else min(head.length, chain.cut)
+        end = head.length if chain.limit is None else min(head.length, chain.limit)
         end = min(end, waiting.get(head.author, end))
         return (mine, end) if end > mine else None
 

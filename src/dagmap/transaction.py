@@ -15,9 +15,15 @@ import numpy as np
 
 from . import wire
 from .config import Config
-from .identity import Identity, author_of, signature_holds
+from .identity import Identity, author_of, certificate_holds, signature_holds
 from .model import AuthorId, Reason, TransactionId
-from .payload import Payload, decode_payload, encode_payload
+from .payload import (
+    MAX_SEQUENCE,
+    Payload,
+    decode_payload,
+    encode_payload,
+    first_certificate,
+)
 from .wire import Reader, Refusal
 
 VERSION = 1
@@ -95,14 +101,22 @@ def seal(
     return unsigned + identity.sign(_SIGNED + config.fleet_id + unsigned)
 
 
+def glance(data: bytes) -> tuple[AuthorId, TransactionId | None]:
+    """Author and previous id (None: it is the first) that bytes claim; nothing of it is proven.
+
+    Raises Refusal where they cannot be read.
+    """
+    reader = Reader(data)
+    author = author_of(_public_key(reader))
+    return author, reader.take(32) if reader.number(MAX_SEQUENCE) else None
+
+
 def parse(data: bytes, config: Config) -> Transaction:
     """Judge foreign bytes. Raises Refusal; the cheap checks come first, the payload last."""
     if len(data) > MAX_SIZE:
         raise Refusal(Reason.MALFORMED, f"transaction of {len(data)} bytes")
     reader = Reader(data)
-    if reader.take(1)[0] != VERSION:
-        raise Refusal(Reason.VERSION, f"transaction version {data[0]}")
-    public_key = reader.take(32)
+    public_key = _public_key(reader)
     author = author_of(public_key)
     try:
         return _parse(reader, data, public_key, author, config)
@@ -110,10 +124,17 @@ def parse(data: bytes, config: Config) -> Transaction:
         raise Refusal(refusal.reason, refusal.detail, author) from None
 
 
+def _public_key(reader: Reader) -> bytes:
+    version = reader.take(1)[0]
+    if version != VERSION:
+        raise Refusal(Reason.VERSION, f"transaction version {version}")
+    return reader.take(32)
+
+
 def _parse(
     reader: Reader, data: bytes, public_key: bytes, author: AuthorId, config: Config
 ) -> Transaction:
-    sequence = reader.number((1 << 40) - 1)
+    sequence = reader.number(MAX_SEQUENCE)
     previous = reader.take(32) if sequence else None
     lamport = reader.number(MAX_LAMPORT)
     count = reader.number(config.transaction.max_references)
@@ -126,11 +147,18 @@ def _parse(
     unworked = data[: reader.at]
     nonce, signature = reader.take(4), reader.take(64)
     reader.end()
+    certified = sequence == 0 and config.closed and public_key != config.fleet_public_key
+    certificate = first_certificate(body) if certified else None
     if not _work_holds(_work_seed(config, unworked), nonce, config):
         raise Refusal(Reason.PROOF_OF_WORK)
+    if certificate is not None and not certificate_holds(
+        certificate, config.fleet_public_key, config.fleet_id, public_key
+    ):
+        raise Refusal(Reason.CERTIFICATE, "the fleet key has not signed it for this robot")
     if not signature_holds(public_key, signature, signed_part(data, config)):
         raise Refusal(Reason.SIGNATURE)
     payload = decode_payload(body, config.graph.n_p)
+    _check_standing(payload, sequence, public_key, config)
     _check_structure(payload, config)
     return Transaction(
         id_of(data),
@@ -144,6 +172,27 @@ def _parse(
         payload,
         place,
     )
+
+
+def _check_standing(payload: Payload, sequence: int, public_key: bytes, config: Config) -> None:
+    """Which records an author may sign at all.
+
+    In a closed fleet the certificate stands in a robot's first transaction, and names it; the
+    fleet key revokes, and says nothing else; nobody else does. An open fleet has neither.
+    """
+    if config.closed and public_key == config.fleet_public_key:
+        others = replace(payload, revocations=())
+        if not payload.revocations or encode_payload(others):
+            raise Refusal(Reason.STRUCTURE, "the fleet key signs revocations and nothing else")
+        if author_of(public_key) in (gone.author for gone in payload.revocations):
+            raise Refusal(Reason.STRUCTURE, "the fleet key revokes itself")
+        return
+    if payload.revocations:
+        raise Refusal(Reason.STRUCTURE, "a revocation that is not the fleet key's")
+    if payload.certificate is not None and not (config.closed and sequence == 0):
+        raise Refusal(Reason.STRUCTURE, "a certificate where none belongs")
+    if payload.name is not None and config.closed:
+        raise Refusal(Reason.STRUCTURE, "a profile: in a closed fleet the certificate names robots")
 
 
 def _check_structure(payload: Payload, config: Config) -> None:

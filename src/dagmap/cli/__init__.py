@@ -9,12 +9,14 @@ from typing import Annotated
 import typer
 
 from .. import __version__
+from .keys import app as keys
 
 app = typer.Typer(
     help="One map for a fleet of robots, the same on every robot, without a central station.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
+app.add_typer(keys, name="keys")
 
 
 def _version(wanted: bool) -> None:

@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.progress import track
 
 from ..agent import Agent
+from ..io.checkpoint_file import CheckpointFile
 from ..io.data_folder import next_session, open_folder, restore
 from ..io.log import Level, Log
 from ..io.metrics import MetricsServer
@@ -87,7 +88,10 @@ class AgentCommand:
         transport = stack.enter_context(
             Transport(config.network, settings.folder, config.fleet_id, identity.author, inbox)
         )
-        runtime = Runtime(agent, store, transport, inbox, log, partial(_report, transport))
+        checkpoint = CheckpointFile(store, log)
+        answer = partial(_report, transport)
+        runtime = Runtime(agent, store, transport, inbox, log, answer, checkpoint.keep)
+        stack.callback(checkpoint.write, agent)  # closes before the store does
         stack.enter_context(StatusServer(settings.control, inbox))
         if (address := config.metrics.address) is not None:
             stack.enter_context(MetricsServer(address, runtime, transport))
@@ -128,11 +132,12 @@ def _log_start(log: Log, agent: Agent, settings: Settings, session: int) -> None
         transactions=len(agent.ledger),
         session=session,
     )
-    log.write(
-        "warning",
-        "open mode",
-        meaning="any key may take part: no bound against liars holds; for a first try only",
-    )
+    if not agent.config.closed:
+        log.write(
+            "warning",
+            "open mode",
+            meaning="any key may take part: no bound against liars holds; for a first try only",
+        )
 
 
 @contextmanager

@@ -76,12 +76,14 @@ def warm_fold() -> None:
         cores=np.zeros(0, np.int64),
         sightings=np.zeros(1, np.int64),
         sighting_cycle=np.ones(1, np.int32),
+        origin=np.zeros((n, 3), np.int32),
     )
     fold, rays = DefaultFold(config), RayEvidence(config.cell_mm, config.max_ray_mm)
     starts, origins = np.array([0, n], np.int64), np.zeros((1, 3), np.int32)
     fold.apply(block)
     rays.walk(0, origins, starts, places, alive, 1)
     fold.evaluate(rays)
+    rays.walk(0, origins, starts, places, alive, -1)  # else the first fork would wait for it
     fold.undo(block)
     rays.walk(0, origins, starts, places, alive, -1)  # frees what has become zero
 

@@ -73,6 +73,7 @@ class Replay:
         if not 0 <= self.loss < 1:
             raise DagmapError(f"--loss {self.loss}: a share from 0 up to, not including, 1")
         config = Config() if self.config_file is None else load_config(self.config_file)
+        config = msgspec.structs.replace(config, fleet_key="")  # keys follow from the names here
         sources = self._open_sources()
         prepare_out(self.out, self.force)
         started = time.perf_counter()

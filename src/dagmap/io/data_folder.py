@@ -8,15 +8,20 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 
+import msgspec
+
 from ..agent import Agent
 from ..identity import Identity
 from ..model import StoreError
 from ..transaction import id_of
+from . import keys
+from .checkpoint_file import read_checkpoint
 from .settings import Settings
 from .store import Store
 
 Track = Callable[[Iterable[bytes], int], Iterable[bytes]]
 _KEY = "robot.key"
+_MADE = "author"  # in a closed fleet, whose key lies elsewhere: whose ledger was made here
 
 
 def load_identity(folder: Path) -> Identity:
@@ -41,21 +46,29 @@ def load_identity(folder: Path) -> Identity:
 
 
 def open_folder(settings: Settings) -> tuple[Identity, Store]:
-    """The robot's key and its open ledger, both made where this is the first start."""
+    """The robot's key and its open ledger, made where this is the first start.
+
+    In a closed fleet the key is the enrolled one. Raises StoreError, and KeysError for that key.
+    """
     path, fleet = settings.ledger, settings.config.fleet_id
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
         raise StoreError(f"{path.parent}: cannot be made ({error.strerror})") from None
+    closed = settings.config.closed
+    identity = keys.load_identity(settings.keys) if closed else None
     if not path.exists():
-        if (path.parent / _KEY).exists():
+        if (path.parent / (_MADE if closed else _KEY)).exists():
             raise StoreError(
-                f"{path}: the ledger of the key beside it is gone; restore it from a backup, or "
-                f"remove {_KEY} too: the robot then starts as a new one. Under its old key it "
-                "would sign its numbers twice"
+                f"{path}: the ledger of the robot's key is gone; restore it from a backup, or "
+                f"{f'enroll the robot anew and remove {_MADE}' if closed else f'remove {_KEY} too'}"
+                ": it then starts as a new one. Under its old key it would sign its numbers twice"
             )
         Store.open(path, fleet).close()  # first of all, so that a key without a ledger is a loss
-    identity = load_identity(path.parent)
+    if identity is None:
+        identity = load_identity(path.parent)
+    elif not (path.parent / _MADE).exists():
+        _write_secret(path.parent / _MADE, identity.author.hex())
     return identity, Store.open(path, fleet, identity.author)
 
 
@@ -64,7 +77,11 @@ def restore(settings: Settings, identity: Identity, store: Store, track: Track) 
 
     track: wraps the transactions (their number is known) to show how far it is.
     """
-    agent = Agent.restore(identity, settings.config, track(store, len(store)))
+    config = settings.config
+    if config.closed and not config.name:
+        config = msgspec.structs.replace(config, name=identity.name or "")
+    tracked = track(store, len(store))
+    agent = Agent.restore(identity, config, tracked, checkpoint=read_checkpoint(store))
     lost = sum(agent.ledger.find(id_of(data)) is None for data in store)
     if lost:
         raise StoreError(

@@ -189,14 +189,16 @@ def _remove_results(path: Path) -> None:
 
 
 @contextmanager
-def atomic_write(path: Path) -> Iterator[BinaryIO]:
+def atomic_write(path: Path, mode: int = 0o666) -> Iterator[BinaryIO]:
     """Give a file to write to; it takes its name when the block ends well and is gone when not.
 
+    mode: who may use it, less what the user's umask takes away.
     Raises OutputError that names the file and the remedy.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}{_PART}")
     try:
-        with open(part, "wb") as file:
+        handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode)
+        with open(handle, "wb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())

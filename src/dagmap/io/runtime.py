@@ -26,6 +26,7 @@ from ..model import (
     Outgoing,
     Reason,
     Rejected,
+    Revoked,
     TransactionId,
 )
 from .log import Log
@@ -85,10 +86,14 @@ class Runtime:
         inbox: Inbox,
         log: Log,
         report: Callable[[Runtime], dict[str, object]],
+        keep: Callable[[Agent], None] = lambda agent: None,
     ) -> None:
-        """report: the answer to a question that somebody puts into the inbox."""
+        """report: the answer to a question that somebody puts into the inbox.
+
+        keep: called now and then, to keep what makes the next start faster.
+        """
         self.agent, self.network, self.inbox = agent, network, inbox
-        self._store, self._log, self._report = store, log, report
+        self._store, self._log, self._report, self._keep_state = store, log, report, keep
         self.counts = Counts()
         self.started = time.monotonic()
         self._next_tick = self._next_state = self.started
@@ -180,9 +185,28 @@ class Runtime:
                     if mine
                     else "nothing of this author from there on counts",
                 )
+            elif isinstance(event, Revoked):
+                self._note_revocation(event)
         if time.monotonic() >= self._next_state:
             self._next_state = time.monotonic() + _STATE_PERIOD
             self._log.write("info", "state", **self._state())
+            self._keep_state(self.agent)
+
+    def _note_revocation(self, event: Revoked) -> None:
+        mine, lifted = event.author == self.agent.identity.author, event.count is None
+        if lifted:
+            consequence = "the fleet key was used twice: this revocation counts no more"
+        elif mine:
+            consequence = "this robot issues nothing more; enroll it anew to go on"
+        else:
+            consequence = "nothing of this author from there on counts"
+        self._log.write(
+            "error" if mine or lifted else "warning",
+            "revoked",
+            author=event.author.hex(),
+            count=event.count,
+            consequence=consequence,
+        )
 
     def _note_refusal(self, event: Rejected) -> None:
         self.counts.refused[event.reason] += 1

@@ -101,6 +101,7 @@ class AgentConfig(Config, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """A configuration file of `dagmap agent`: the keys of `Config`, and these tables."""
 
     store: StoreConfig
+    keys: str = "."  # in a closed fleet: the folder that `dagmap keys enroll` made
     source: SourceConfig | None = None
     network: NetworkConfig = NetworkConfig()
     metrics: MetricsConfig = MetricsConfig()
@@ -123,6 +124,11 @@ class Settings:
         return self.at(self.config.store.path)
 
     @property
+    def keys(self) -> Path:
+        """The robot's key and certificate, in a closed fleet."""
+        return self.at(self.config.keys)
+
+    @property
     def control(self) -> Path:
         """Of the socket that answers `dagmap status`."""
         path = self.config.control.path
@@ -130,12 +136,13 @@ class Settings:
 
 
 def load_settings(path: Path) -> Settings:
-    """Read a configuration file. A robot without a name is called like its file.
+    """Read a configuration file. A robot without a name is called like its file, or in a closed
+    fleet as its certificate says.
 
     Raises ConfigError that names the file, the key and what is wanted.
     """
     config = load_config(path, AgentConfig)
-    if not config.name:
+    if not config.name and not config.closed:
         try:
             config = msgspec.structs.replace(config, name=path.stem)
         except ConfigError as error:

@@ -24,6 +24,7 @@ _TRANSACTIONS = """CREATE TABLE transactions (
     position INTEGER PRIMARY KEY, id BLOB NOT NULL UNIQUE, data BLOB NOT NULL)"""
 _INSERT = "INSERT OR IGNORE INTO transactions (id, data) VALUES (?, ?)"
 _SELECT = "SELECT position, id, data FROM transactions WHERE position > ? ORDER BY position LIMIT ?"
+_COUNT = "SELECT count(*) FROM transactions NOT INDEXED"  # an index may be damaged on its own
 _BUSY = 1.0  # s to wait for another process that is just closing the file
 _AFRESH = (
     "restore it from a backup, or move it away and let the robot copy the ledger from a neighbour "
@@ -90,7 +91,7 @@ class Store:
         """Store several (id, data) at the cost of one: all of them, or on an error none."""
         rows = list(transactions)
         for id_, data in rows:
-            if hashlib.blake2b(data, digest_size=32).digest() != id_:
+            if _id_of(data) != id_:
                 raise StoreError(
                     f"{self.path}: {id_.hex()} is not the BLAKE2b-256 of its {len(data)} bytes; "
                     "store the id and data of one Accepted event"
@@ -107,16 +108,22 @@ class Store:
             if not rows:
                 return
             for position, id_, data in rows:
-                if hashlib.blake2b(data, digest_size=32).digest() != id_:
+                if not isinstance(data, bytes) or _id_of(data) != id_:
                     raise StoreError(
                         f"{self.path}: entry {position} does not match its id; "
                         f"the file is damaged; {_AFRESH}"
                     )
                 yield data
 
+    def ids(self) -> list[TransactionId]:
+        """The ids of all transactions in order of insertion."""
+        with _explained(self.path, "cannot be read"):
+            rows = self._in_use.execute("SELECT id FROM transactions ORDER BY position").fetchall()
+        return [id_ for (id_,) in rows]
+
     def __len__(self) -> int:
         with _explained(self.path, "cannot be read"):
-            return int(self._in_use.execute("SELECT count(*) FROM transactions").fetchone()[0])
+            return int(self._in_use.execute(_COUNT).fetchone()[0])
 
     def __bool__(self) -> bool:
         """An empty store is a store all the same."""
@@ -171,14 +178,17 @@ class Store:
             detail = " ".join(check.split())
             raise StoreError(f"{self.path}: the file is damaged ({detail}); {_AFRESH}")
         with self._transaction("cannot be opened for writing"):
-            tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master")}
-            if not tables and fleet_id is not None:
+            made = {sql for (sql,) in database.execute("SELECT sql FROM sqlite_master")}
+            if not made and fleet_id is not None:
                 self._create(database, fleet_id)
-            elif "meta" not in tables:
+                made = {_META, _TRANSACTIONS}
+            if _META not in made:
                 raise StoreError(
                     f"{self.path}: a database, but no DAGmap ledger; name another file"
                 )
             self._claim(database, fleet_id, author)
+            if _TRANSACTIONS not in made:
+                raise StoreError(f"{self.path}: the file is damaged (no table); {_AFRESH}")
 
     def _create(self, database: sqlite3.Connection, fleet_id: bytes) -> None:
         database.execute(_META)
@@ -197,6 +207,8 @@ class Store:
                 f"{self.path}: written in format {version or 'unknown'}, this version of DAGmap "
                 f"reads format {FORMAT}; open it with the version that wrote it"
             )
+        if "fleet" not in meta:
+            raise StoreError(f"{self.path}: the file is damaged (no fleet); {_AFRESH}")
         self.fleet_id, self.author = meta["fleet"], meta.get("author")
         if fleet_id is not None and self.fleet_id != fleet_id:
             raise StoreError(
@@ -215,12 +227,16 @@ class Store:
             )
 
 
+def _id_of(data: bytes) -> TransactionId:
+    return hashlib.blake2b(data, digest_size=32).digest()
+
+
 @contextmanager
 def _explained(path: Path, trouble: str) -> Iterator[None]:
     """Turn what SQLite raises into StoreError with the file, the trouble and the remedy."""
     try:
         yield
-    except sqlite3.Error as error:
-        text = str(error)
+    except (sqlite3.Error, UnicodeDecodeError, MemoryError) as error:  # a damaged file asks for any
+        text = " ".join(str(error).split()) if isinstance(error, sqlite3.Error) else "malformed"
         remedy = next((words for part, words in _REMEDIES.items() if part in text), text)
         raise StoreError(f"{path}: {trouble}: {remedy} ({text})") from error

@@ -12,6 +12,7 @@ import json
 import threading
 from collections import Counter
 from collections.abc import Iterable
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from types import TracebackType
@@ -100,10 +101,19 @@ class Transport:
         return self._queue.dropped
 
     def close(self, patience: float = 1.0) -> None:
-        """Send what waits, for so many seconds at most, and leave. Closing twice is harmless."""
+        """Send what waits, for so many seconds at most, and leave. Closing twice is harmless.
+
+        Zenoh takes its time to leave a link that is stuck: that, too, gets `patience` seconds.
+        """
         self._queue.close()
         self._sender.join(patience)
-        self._session.close()  # type: ignore[no-untyped-call]
+        leaving = threading.Thread(target=self._leave, name="dagmap leave", daemon=True)
+        leaving.start()
+        leaving.join(patience)
+
+    def _leave(self) -> None:
+        with suppress(self._zenoh.ZError):  # it gave up on a link; the process ends anyway
+            self._session.close()  # type: ignore[no-untyped-call]
 
     def __enter__(self) -> Transport:
         return self

@@ -18,7 +18,7 @@ from .jit import inner, leaf
 _P = (1 << 31) - 1
 _LOW = 1 << 29  # makes coordinates positive; products stay below 2^62
 X, Y, Z, OLDER = 0, 1, 2, 3  # columns of Nodes.seed; OLDER: next node of the same bucket
-AUTHOR, HITS, CYCLE, NEXT = 0, 1, 2, 3  # columns of Nodes.entries
+AUTHOR, HITS, CYCLE, NEXT, SEEN = 0, 1, 2, 3, 4  # columns of Nodes.entries
 NODES, ENTRIES = 0, 1  # places in Nodes.sizes
 FIRST_SEEN = -1  # undo: the observation made the author's entry at the node
 NOT_COUNTED = -2  # undo: no hit, the author's cycle had counted already
@@ -36,7 +36,8 @@ class Nodes(NamedTuple):
     color: Int64s  # (N, 3) sum of the colours
     color_count: Int32s  # (N,) observations with a colour
     first: Int32s  # (N,) newest entry of the node
-    entries: Int32s  # (E, 4) author, hits, last counted cycle, next entry of the node or -1
+    entries: Int32s  # (E, 5) author, hits, last counted cycle, next entry or -1, observations
+    origin: Int32s  # (N, 3) mm, where the sensor of the first observation was
 
 
 class Seen(NamedTuple):
@@ -49,6 +50,7 @@ class Seen(NamedTuple):
     colored: Bools
     sightings: Int64s
     sighting_cycle: Int32s
+    origin: Int32s
 
 
 @inner
@@ -138,6 +140,7 @@ def _hit(nodes: Nodes, node: int, author: int, cycle: int) -> int:
     nodes.entries[entry, HITS] = 1
     nodes.entries[entry, CYCLE] = cycle
     nodes.entries[entry, NEXT] = nodes.first[node]
+    nodes.entries[entry, SEEN] = 0
     nodes.first[node] = entry
     nodes.sizes[ENTRIES] = entry + 1
     return FIRST_SEEN
@@ -156,6 +159,15 @@ def _take_back(nodes: Nodes, node: int, author: int, before: int) -> None:
         entry = int(nodes.entries[entry, NEXT])
     nodes.entries[entry, HITS] -= 1
     nodes.entries[entry, CYCLE] = before
+
+
+@inner
+def _note(nodes: Nodes, node: int, author: int, sign: int) -> None:
+    """Count an observation in the author's entry, which is there."""
+    entry = int(nodes.first[node])
+    while int(nodes.entries[entry, AUTHOR]) != author:
+        entry = int(nodes.entries[entry, NEXT])
+    nodes.entries[entry, SEEN] += sign
 
 
 @inner
@@ -195,9 +207,12 @@ def apply(
         node = find_twin(nodes, shift, reach, x, y, z)
         if node < 0:
             node = _create(nodes, shift, x, y, z)
+            for axis in range(3):
+                nodes.origin[node, axis] = seen.origin[i, axis]
         _accumulate(nodes, node, seen, i, 1)
         features[base + i] = node
         undo[i] = _hit(nodes, node, author, int(seen.cycle[i]))
+        _note(nodes, node, author, 1)
     for j in range(seen.sightings.shape[0]):
         number = int(seen.sightings[j])
         undo[count + j] = NOT_COUNTED
@@ -226,10 +241,60 @@ def revert(
         node = int(features[base + i])
         if node < 0:
             continue
+        _note(nodes, node, author, -1)
         _take_back(nodes, node, author, int(undo[i]))
         _accumulate(nodes, node, seen, i, -1)
         if nodes.observed[node] == 0:
             _discard_newest(nodes, shift)
+
+
+@inner
+def _gather(nodes: Nodes, node: int, part: Int32s, touched: Int32s, count: int) -> int:
+    """Add a node's observations to the parts of their authors; how many are touched now."""
+    entry = int(nodes.first[node])
+    while entry >= 0:
+        author = int(nodes.entries[entry, AUTHOR])
+        seen = int(nodes.entries[entry, SEEN])
+        if part[author] == 0 and seen > 0:
+            touched[count] = author
+            count += 1
+        part[author] += seen
+        entry = int(nodes.entries[entry, NEXT])
+    return count
+
+
+@leaf
+def support(
+    nodes: Nodes, shift: int, reach: int, say: int, part: Int32s, touched: Int32s, out: Int32s
+) -> None:
+    """Observations in the nodes whose seeds lie within `reach` mm of each node's, at most `say`
+    of an author; the node's own among them.
+
+    part: (A,) zeros, and zeros again afterwards; touched: (A,); out: (N,) is written.
+    """
+    buckets, seed, key = nodes.buckets, nodes.seed, nodes.key
+    mask = buckets.shape[0] - 1
+    for node in range(out.shape[0]):
+        x, y, z = int(seed[node, X]), int(seed[node, Y]), int(seed[node, Z])
+        count = 0
+        for cz in range((z - reach) >> shift, ((z + reach) >> shift) + 1):
+            for cy in range((y - reach) >> shift, ((y + reach) >> shift) + 1):
+                for cx in range((x - reach) >> shift, ((x + reach) >> shift) + 1):
+                    near = int(buckets[_bucket(key, mask, cx, cy, cz)])
+                    while near >= 0:
+                        u, v, w = int(seed[near, X]), int(seed[near, Y]), int(seed[near, Z])
+                        d2 = (u - x) * (u - x) + (v - y) * (v - y) + (w - z) * (w - z)
+                        if d2 <= reach * reach and (
+                            u >> shift == cx and v >> shift == cy and w >> shift == cz
+                        ):  # a bucket may serve two of these cells
+                            count = _gather(nodes, near, part, touched, count)
+                        near = int(seed[near, OLDER])
+        total = 0
+        for k in range(count):
+            author = int(touched[k])
+            total += min(say, int(part[author]))
+            part[author] = 0
+        out[node] = total
 
 
 @leaf

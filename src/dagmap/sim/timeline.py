@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from ..model import Accepted, Forked, Issued, MapChanged, Rejected, Waiting
+from ..model import Accepted, Forked, Issued, MapChanged, Rejected, Revoked, Waiting
 from .robot import Crashed, Happening, Observed, Received, Restarted, Robot
 
 
@@ -46,6 +46,8 @@ def _text(happening: Happening) -> str | None:
             return f"refuses {whose}: {reason.value} {detail}".rstrip()
         case Forked(author, sequence):
             return f"proves a fork of {author.hex()} at {sequence}"
+        case Revoked(author, count):
+            return f"counts {'all' if count is None else count} of {author.hex()} from now on"
         case Crashed(moment):
             return f"crashes {moment}"
         case Restarted(transactions):

@@ -35,11 +35,11 @@ def load_camera(path: Path) -> Camera:
     keys = ", ".join(Camera.__struct_fields__)
     try:
         camera = msgspec.json.decode(read_bytes(path), type=Camera)
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, RecursionError) as error:
         raise RecordingError(f"{path}: {error}; an object with {keys} is wanted") from None
     for key in ("fx", "fy", "width", "height", "depth_scale"):
         value = getattr(camera, key)
-        if not (value > 0 and math.isfinite(value)):
+        if not 0 < value < math.inf:  # a whole number may be too large for a float
             raise RecordingError(f"{path}: {key} = {value}; more than 0 is wanted")
     return camera
 

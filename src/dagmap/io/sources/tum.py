@@ -90,10 +90,17 @@ def _frames(path: Path) -> list[_Frame]:
         )
     for frame in frames:
         for picture in (frame.color, frame.depth):
-            if not picture.is_file():
+            if not _is_file(picture):
                 by = f", named in {frame.line}" if frame.line else ""
                 raise RecordingError(f"{picture}: missing{by}; copy it or drop its frame")
     return frames
+
+
+def _is_file(picture: Path) -> bool:
+    try:
+        return picture.is_file()
+    except OSError:  # a name too long, a folder that may not be entered
+        return False
 
 
 def _associated(path: Path, file: Path) -> list[_Frame]:
@@ -177,7 +184,8 @@ def _trajectory(file: Path) -> tuple[Floats, Floats]:
 def _pose(values: list[float], line: str) -> Floats:
     """(4, 4) from translation and quaternion."""
     quaternion = np.array(values[3:])
-    length = float(np.linalg.norm(quaternion))
+    with np.errstate(over="ignore"):  # to infinity, which is refused
+        length = float(np.linalg.norm(quaternion))
     if not 0.9 < length < 1.1:
         raise RecordingError(f"{line}: a quaternion of length {length:.3g}; 1 is wanted")
     x, y, z, w = quaternion / length

@@ -1,0 +1,184 @@
+"""A TUM RGB-D folder: lists, camera, pictures. An input is files one after the other."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+from random import Random
+
+import cv2
+import numpy as np
+
+from dagmap import wire
+from dagmap.io.sources import Options, tum
+from dagmap.model import DagmapError
+from dagmap.wire import Reader, Refusal
+from grammar import Flip, many, record, rest, sized, tree
+from grammar import mutate as mutate_tree
+from targets import Target
+from targets._files import workplace
+
+_HOME = workplace()
+_NAME = re.compile(r"((rgb|depth)/)?[A-Za-z0-9._-]{1,60}\Z")
+_FILES = many(record(sized(rest), sized(rest)))
+_WORDS = (
+    "0",
+    "1",
+    "1.02",
+    "-1",
+    "nan",
+    "1e400",
+    "1e300",
+    "1_0",
+    "x",
+    "#",
+    ",",
+    "",
+    "rgb/1.png",
+    "rgb",
+    "a" * 300,
+    "\0",
+    "../x",
+    "depth/1.png",
+    "/",
+    "\u0663",
+    "9" * 5000,
+    "\x1b[2J",
+    "\u2028",
+    "\n",
+    "\r",
+    "[" * 3000,
+    "{}",
+    '"fx": 1e999',
+    "1" * 400,
+    "null",
+    "true",
+    "\\ud800",
+)
+
+
+def run(data: bytes) -> bool:
+    folder = _HOME / "walk"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    _unpack(folder, data)
+    try:
+        if not tum.matches(folder):
+            return False
+        source = tum.open(folder, Options(max_features=50, max_depth=10.0))
+        cycles = list(source)
+    except DagmapError as error:
+        assert str(folder) in str(error) and "\n" not in str(error)
+        return False
+    assert len(cycles) == len(source) > 0
+    return True
+
+
+def _unpack(folder: Path, data: bytes) -> None:
+    """Names that lead out of the folder are left out."""
+    reader, made = Reader(data), 0
+    while reader.left and made < 16:
+        try:
+            name, body = reader.take(reader.number()), reader.take(reader.number())
+        except Refusal:
+            return
+        made += 1
+        text = name.decode("ascii", "replace")
+        path = folder / text
+        try:
+            if text.endswith("/") and _NAME.match(text[:-1]):
+                path.mkdir(parents=True, exist_ok=True)
+            elif _NAME.match(text):
+                path.parent.mkdir(exist_ok=True)
+                path.write_bytes(body)
+        except OSError:  # a file where a folder is wanted, or the other way round
+            continue
+
+
+def mutate(data: bytes, rng: Random, flip: Flip) -> bytes:
+    """A word of a list becomes another; or files come, go, change names and bytes."""
+    if rng.random() < 0.4:
+        root = tree(data, _FILES)
+        mutate_tree(root, rng, flip)
+        return root.dump()
+    files = _read(data)
+    if not files:
+        return flip(data)
+    i = rng.randrange(len(files))
+    name, body = files[i]
+    words = re.split(rb"([ \n,:]+)", body)
+    if b"png" in name or b"jpg" in name or len(words) > 2000:
+        return pack([*files[:i], (name, flip(body)), *files[i + 1 :]])
+    j = rng.randrange(len(words))
+    words[j] = rng.choice((rng.choice(_WORDS).encode(), rng.choice(words), flip(words[j])))
+    return pack([*files[:i], (name, b"".join(words)), *files[i + 1 :]])
+
+
+def _read(data: bytes) -> list[tuple[bytes, bytes]]:
+    reader, files = Reader(data), []
+    try:
+        while reader.left:
+            files.append((reader.take(reader.number()), reader.take(reader.number())))
+    except Refusal:
+        pass
+    return files
+
+
+def pack(files: Iterable[tuple[bytes, bytes]]) -> bytes:
+    """Files as one input."""
+    return b"".join(wire.number(len(part)) + part for file in files for part in file)
+
+
+def seeds() -> Iterable[bytes]:
+    camera = {
+        "fx": 20.0,
+        "fy": 20.0,
+        "cx": 20.0,
+        "cy": 20.0,
+        "width": 40,
+        "height": 40,
+        "depth_scale": 1000.0,
+    }
+    color = np.kron(
+        np.random.default_rng(1).integers(0, 256, (5, 5), np.uint8), np.ones((8, 8), np.uint8)
+    )
+    png = [
+        cv2.imencode(".png", picture)[1].tobytes()
+        for picture in (color, np.full((40, 40), 2000, np.uint16))
+    ]
+    jpg = cv2.imencode(".jpg", color)[1].tobytes()
+    start = [(b"camera.json", json.dumps(camera).encode())]
+    truth = (b"groundtruth.txt", b"# stamp pose\n1 0 0 0 0 0 0 1\n1.5,0,0,1,0,0,0,1\n")
+    pictures = [(b"rgb/1.0.png", png[0]), (b"depth/1.01.png", png[1])]
+    yield pack([*start, truth, *pictures])
+    listed = [
+        (b"rgb.txt", b"1 rgb/1.0.png\n9 rgb/1.0.png\n"),
+        (b"depth.txt", b"1.01 depth/1.01.png\n"),
+    ]
+    yield pack([*start, truth, *pictures, *listed])
+    named = (b"associations.txt", b"1 rgb/1.jpg 1.0 depth/1.01.png\n")
+    yield pack([*start, truth, named, (b"rgb/1.jpg", jpg), pictures[1]])
+    yield pack([(b"rgb/", b""), (b"depth/", b"")])
+    yield pack([*start, (b"rgb/", b""), (b"depth/", b"")])
+    yield pack([*start, *pictures])  # no poses
+    yield pack([*start, *pictures, (b"groundtruth.txt/", b"")])
+    yield pack([*start, *pictures, truth, (b"associations.txt", b"1 rgb/1.0.png 1 " + b"x" * 300)])
+    damaged = [(b"rgb/1.0.png", png[0]), (b"depth/1.01.png", jpg)]
+    yield pack([*start, truth, *damaged])
+    size = (100_000).to_bytes(4, "big")
+    chunks = (b"IHDR" + 2 * size + bytes((8, 0, 0, 0, 0)), b"IDAT", b"IEND")
+    parts = (len(c[4:]).to_bytes(4, "big") + c + zlib.crc32(c).to_bytes(4, "big") for c in chunks)
+    huge = b"\x89PNG\r\n\x1a\n" + b"".join(parts)  # more pixels than OpenCV takes
+    yield pack([*start, truth, (b"rgb/1.0.png", huge), pictures[1]])
+
+
+PARSERS = {
+    "dagmap.io.sources.tum": (),
+    "dagmap.io.sources._rgbd": ("import_cv2",),
+    "dagmap.io.sources._source": ("Options.*",),
+}
+TARGET = Target(run, mutate, seeds, PARSERS, max_len=16_384)

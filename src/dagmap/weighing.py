@@ -1,0 +1,70 @@
+"""Section 4.3, preset `default`: what speaks for a node against what speaks against it.
+
+Logarithms are in sixteenths of a bit and whole, so that every machine weighs alike. How the weights
+were found, and what was tried beside them: docs/quality.md.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from .model import Bools, Int32s, Int64s
+
+SIXTEENTHS = 16
+# 256 * 2^(k / 16), rounded up, k from 1 to 15: where the fraction of a logarithm steps.
+_STEPS = np.array(
+    [268, 280, 292, 305, 318, 332, 347, 363, 379, 395, 413, 431, 450, 470, 491], np.int64
+)
+_SUPPORT, _DISTANCE, _PASSED, _HIDDEN, _RECORD = 6, 6, 1, 2, 2
+_PER_SHARE = 200  # the record counts in half percents
+
+
+class Evidence(NamedTuple):
+    """Of N nodes; each author's part in support, passed and hidden is bounded."""
+
+    hits: Int32s  # (N,) see `fold.Verdict`
+    witnesses: Int32s
+    against: Int32s  # (N,) authors whose evidence speaks against the node, each at most miss_say
+    support: Int32s  # (N,) observations around the node, its own among them
+    distance: Int32s  # (N,) mm from the sensor that saw it first
+    passed: Int32s  # (N,) transactions with rays through its cell
+    hidden: Int32s  # (N,) ends that lie between that sensor and the node
+
+
+def log2_16(values: npt.NDArray[np.integer]) -> Int64s:
+    """Sixteen times the binary logarithm of numbers from 1 to 2^52, of their first nine bits."""
+    numbers = np.asarray(values, np.int64)
+    whole = np.frexp(numbers.astype(np.float64))[1].astype(np.int64) - 1  # exact below 2^53
+    head = np.where(whole >= 8, numbers >> np.maximum(whole - 8, 0), numbers << (8 - whole).clip(0))
+    return np.asarray(SIXTEENTHS * whole + np.searchsorted(_STEPS, head, side="right"), np.int64)
+
+
+def lonely(found: Evidence) -> Bools:
+    """(N,) whether nothing was seen around a node but itself, once, and something contradicts."""
+    return np.asarray((found.support <= 1) & (found.against > 0))
+
+
+def records(discredited: Int64s, observed: Int64s) -> Int64s:
+    """What an author's word is discounted by: the share of its observations that are `lonely`.
+
+    discredited, observed: (A,) observations. Sixteenths of bits; 0 for a clean record.
+    """
+    return log2_16(_PER_SHARE * discredited // np.maximum(observed, 1) + 1)
+
+
+def misses(found: Evidence, record: Int64s, delta_mm: int, doubt: int) -> Int32s:
+    """(N,) what counts against each node. record: (N,) that of its most reliable witness.
+
+    A node is dense around itself where it is real, the denser the nearer its sensor was; it is not
+    where rays pass, and nothing lies before it. Only where the balance of that is against a
+    node do the authors who speak against it count; where nobody does, its witness's record does.
+    """
+    spread = log2_16(np.maximum(found.distance, 1)) - log2_16(np.array(delta_mm))
+    balance = _SUPPORT * log2_16(np.maximum(found.support, 1)) + _DISTANCE * spread
+    balance -= _PASSED * log2_16(1 + found.passed) + _HIDDEN * log2_16(1 + found.hidden)
+    balance -= _RECORD * record + SIXTEENTHS * doubt
+    counted = np.where((found.against == 0) & (record > 0), 1, found.against)
+    return np.asarray(np.where(balance <= 0, counted, 0), np.int32)
