@@ -37,6 +37,7 @@ class Issuance:
         self.colored: Bools = np.zeros(0, np.bool_)
         self.seen_again: Int32s = np.zeros(0, np.int32)  # latest cycle that saw it again, or -1
         self._again: list[Int64s] = []
+        self._news = False  # whether `_again` may hold what can go out
         self._ripe: Int64s = np.zeros(0, np.int64)
         self._allowance = 0.0
         self._last: float | None = None
@@ -75,6 +76,7 @@ class Issuance:
         """Nodes that the SLAM observed once more. Only the latest such cycle is kept a node."""
         self.seen_again[nodes] = cycle
         self._again.append(nodes)
+        self._news = True
 
     @property
     def waiting(self) -> bool:
@@ -95,6 +97,7 @@ class Issuance:
     def bundle(self, nodes: Int64s, base: int) -> Bundle:
         """The record of these nodes (ascending), which get the numbers from `base` on."""
         self.number[nodes] = np.arange(base, base + len(nodes))
+        self._news = True
         parents = self.graph.parents(nodes)
         numbers = np.where(parents >= 0, self.number[parents], -1)
         breaks = np.flatnonzero(
@@ -127,6 +130,8 @@ class Issuance:
 
     def _take(self, limit: int) -> Int64s:
         """Cores, newest first, each with its unissued ascendants, until the limit is reached."""
+        if len(self._ripe) == 0:
+            return self._ripe
         per_bundle = self._config.issuance.features_per_bundle
         cores = self._ripe[self._open(self._ripe)]
         cores = np.unique(cores)[::-1]
@@ -145,8 +150,9 @@ class Issuance:
 
     def _sightings(self) -> tuple[Sighting, ...]:
         """Repeated observations of features that are out by now, by cycle."""
-        if not self._again:
+        if not self._again or not self._news:
             return ()
+        self._news = False
         nodes = np.unique(np.concatenate(self._again))
         nodes = nodes[self.seen_again[nodes] >= 0]
         out = self.number[nodes] >= 0
