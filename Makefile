@@ -6,6 +6,8 @@
 #   make test         make check, then the test suite
 #   make check        ruff, mypy, import-linter
 #   make bench        measure the speed (dagmap bench)
+#   make sweep        thousands of simulated missions with faults and liars; SEEDS=2000 for more
+#   make reliability  all figures and plots of docs/reliability.md; hours
 #   make fuzz         fuzz all that reads foreign bytes, 10^6 executions (RUNS=...); Linux, Python 3.11 on
 #   make lock         renew requirements/*.txt after a change of dependencies in pyproject.toml
 #   make clean-cache  forget compiled kernels
@@ -25,12 +27,15 @@ COMPILE := $(LOCK)/bin/uv pip compile --quiet --upgrade --universal --python-ver
   --custom-compile-command 'make lock' pyproject.toml requirements/build.in
 # Tests that compare kernels with their slow twins; they must also pass as plain Python.
 TWINS := tests/test_graph.py tests/test_fold.py tests/test_codec.py tests/test_frames.py
+# The long scenarios are runs of their own; a sweep takes the short ones, with so many seeds each.
+SWEPT = $(filter-out scenarios/hour.toml scenarios/hundred.toml,$(wildcard scenarios/*.toml))
+SEEDS ?= 500
 OFFICE := examples/office/robot1 examples/office/robot2 examples/office/robot3
 
 # A sourced ROS workspace sets PYTHONPATH; its packages must not mix with those of the environments.
 unexport PYTHONPATH
 
-.PHONY: demo fleet test check bench fuzz lock clean clean-cache
+.PHONY: demo fleet test check bench sweep reliability fuzz lock clean clean-cache
 .DELETE_ON_ERROR:
 
 demo: $(DEMO)/.package
@@ -53,6 +58,12 @@ check: $(TEST)/.package
 
 bench: $(TEST)/.package
 	@$(TEST)/bin/dagmap bench
+
+sweep: $(TEST)/.package
+	@$(TEST)/bin/dagmap simulate $(SWEPT) --seeds $(SEEDS)
+
+reliability: $(TEST)/.package
+	@$(TEST)/bin/python bench/reliability.py
 
 RUNS ?= 1000000
 fuzz: $(TEST)/.fuzz

@@ -9,10 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 from matplotlib.figure import Figure
-
-mpl.use("Agg")
 
 BOUND = "To be stated."
 
@@ -41,7 +38,7 @@ honest robots have one digest. Scenarios: {scenarios}, {seeds_each} seeds each (
 
 ## Loss
 
-{fleet} robots work for {mission:.0f} s, a transaction of about {points} points a second each.
+{fleet} robots work for {mission:.0f} s, each looks at {points} points a second.
 Then they have time to agree: from when the last transaction was issued until the last robot holds
 everything, in announcement periods ({period:g} s), over {runs} seeds. *Ideal* is a flood without
 loss over the same links, each hop one mean delay. In *all hear all* a transaction comes at once
@@ -96,7 +93,7 @@ def _text(figures: dict[str, Any]) -> str:
         ),
         shortened=""
         if options["seconds"] is None
-        else f"\n**The long missions were cut to {options['seconds']:g} s, for a look.**",
+        else f"\n\n**The long missions were cut to {options['seconds']:g} s, for a look.**",
         **{name: version(name) for name in ("dagmap", "numpy", "numba")},
         python=platform.python_version(),
         machine=f"{platform.system()} {platform.machine()}",
@@ -128,7 +125,7 @@ def _hundred(run: dict[str, Any]) -> str:
     end = "one digest" if run["agreed"] else "**no agreement**"
     over = run["bytes_received"] / max(1, run["bytes_minimum"])
     return (
-        f"{run['robots']} robots for {run['mission_s']:,.0f} s in {run['wall_s']:,.0f} s of wall: "
+        f"{run['robots']} robots, {run['mission_s']:,.0f} s in {run['wall_s']:,.0f} s (wall): "
         f"{run['transactions']:,} transactions, {run['messages']:,} messages "
         f"({run['messages_per_s']:,.0f} a second), {over:.1f} times the least bytes, {end}"
     )

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import io
+import json
 import math
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from statistics import mean
@@ -19,14 +23,18 @@ from dagmap import Config, Cycle
 from dagmap.config import GraphConfig, IssuanceConfig, TransactionConfig
 from dagmap.io.sources import open_source, save_cycles
 from dagmap.model import Accepted, ConfigError, Issued
+from dagmap.payload import Anchor
+from dagmap.sim.building import SceneConfig
 from dagmap.sim.fleet import Crash, Fleet
 from dagmap.sim.invariants import Invariants
+from dagmap.sim.liars import LIARS
 from dagmap.sim.mission import Mission
 from dagmap.sim.network import Link, Network, Partition, Position
 from dagmap.sim.robot import Clock, Crashed, Disk, Happening, Recording, Restarted, Robot
 from dagmap.sim.scenario import Chaos, Clocks, Liars, Scenario, load_scenario
 from dagmap.sim.sensor import SensorConfig
 from dagmap.sim.timeline import Timeline
+from dagmap.sim.walk import MotionConfig
 from scene import QUICK, cycles
 
 SCENARIOS = sorted((Path(__file__).parents[1] / "scenarios").glob("*.toml"))
@@ -365,7 +373,23 @@ def test_recordings_are_what_robots_see_and_crashes_hit_those_too(
     assert broken.play() is not None
     # the cycles of 3 s and 4 s passed while it was down
     assert [round(at) for at, _ in broken.honest[0].observed_at] == [0, 1, 2, 5, 6, 7]
+    short = mission(changed(scenario, crashes=(Crash(robot="r00", at=2.5, down=0.2),)))
+    assert short.play() is not None and short.honest[0].cycles == 8
     assert broken.honest[0].agent.observing.session == 1
+
+
+def test_a_recording_with_sessions_of_its_own_goes_on_after_a_crash() -> None:
+    """The SLAM started anew at 3.0 s and 6.0 s; the process died at 4.4 s: four sessions in all."""
+    source = [replace(cycle, session=int(cycle.stamp) // 3) for cycle in steps(9)]
+    fleet, _ = crashed("between", 4.4, source)
+    sessions = [anchor.session for anchor in anchors(fleet, "a")]
+    assert sessions == [0, 0, 0, 1, 1, 2, 3, 3, 3]
+
+
+def anchors(fleet: Fleet, name: str) -> list[Anchor]:
+    """What a robot published, as the other one knows it."""
+    author = fleet.robots["b"].agent.consensus.authors[fleet.robots[name].author]
+    return [author.anchors[cycle] for cycle in sorted(author.anchors)]
 
 
 def test_a_recording_starts_when_its_robot_does() -> None:
@@ -463,3 +487,67 @@ def test_liars_of_one_kind_in_two_groups_have_names_of_their_own() -> None:
 def test_an_endless_wait_is_not_a_partition() -> None:
     assert Partition(start=0.0, end=math.inf, robots=("a",)).cuts("a", "b", 1e9)
     assert np.isfinite(Scenario().patience)
+
+
+# The document
+
+DOCUMENT = (Path(__file__).parents[1] / "docs" / "simulator.md").read_text()
+TABLES = {
+    "`[scene]`": SceneConfig,
+    "`[sensor]`": SensorConfig,
+    "`[motion]`": MotionConfig,
+    "`[link]`": Link,
+    "`[clocks]`": Clocks,
+    "`[chaos]`": Chaos,
+    "`[[partitions]]`": Partition,
+    "`[[crashes]]`": Crash,
+    "`[[liars]]`": Liars,
+}
+
+
+def rows(heading: str) -> dict[str, str]:
+    """Key and second column of the first table of a section."""
+    section = DOCUMENT.split(f"### {heading}")[1].split("\n#")[0]
+    table = section[section.index("|---") :].split("\n\n")[0]
+    cells = [line.split(" | ") for line in table.splitlines()[1:]]
+    return {key.strip("| `"): second.strip(" |") for key, second, *_ in cells}
+
+
+def default(field: msgspec.structs.FieldInfo) -> str:
+    """As the document says it."""
+    if field.default is msgspec.NODEFAULT:
+        return "required"
+    return "none" if field.default is None else json.dumps(field.default)
+
+
+@pytest.mark.parametrize("heading", TABLES)
+def test_the_document_names_every_key_with_its_default(heading: str) -> None:
+    fields = msgspec.structs.fields(TABLES[heading])
+    assert rows(heading) == {field.name: default(field) for field in fields}
+
+
+def test_the_document_names_every_key_of_a_mission() -> None:
+    lists = dict.fromkeys(("liars", "partitions", "crashes"), "list of tables")
+    wanted = {
+        field.name: "table" if isinstance(field.default, msgspec.Struct) else default(field)
+        for field in msgspec.structs.fields(Scenario)
+    }
+    told = rows("The mission").items()
+    assert {k: second for keys, second in told for k in keys.split("`, `")} == wanted | lists
+
+
+def test_the_document_names_every_liar() -> None:
+    section = DOCUMENT.split("| kind | what it does |")[1].split("\n\n")[0]
+    assert re.findall(r"^\| `(.+?)`", section, re.MULTILINE) == list(LIARS)
+
+
+def test_what_the_document_shows_works(tmp_path: Path) -> None:
+    file = tmp_path / "example.toml"
+    file.write_text(DOCUMENT.split("```toml\n")[1].split("```")[0])
+    assert load_scenario(file).lying == 1
+    code = DOCUMENT.split("```python\n")[1].split("```")[0]
+    with redirect_stdout(io.StringIO()) as out:
+        exec(code, {})
+    first, *robots = out.getvalue().splitlines()
+    assert first.startswith("True ") and len(robots) == 3
+    assert len({line.split()[-1] for line in robots}) == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Literal, Protocol, TypeAlias
 
 import msgspec
@@ -63,19 +64,25 @@ class Source(Protocol):
 
 
 class Recording:
-    """A recording as a source: its first cycle comes at the first start, and it never waits."""
+    """A recording as a source: its first cycle comes at the first start, and it never waits.
+
+    A start after a crash is a new session, beside those that the recording itself has.
+    """
 
     def __init__(self, cycles: Iterable[Cycle]) -> None:
         self._cycles = iter(cycles)
         self._offset: float | None = None
+        self._last: Cycle | None = None  # handed out; it may still have been to come at a crash
 
     def cycles(self, start: float, session: int) -> Iterator[Timed]:
-        for cycle in self._cycles:
+        last = [] if self._last is None else [self._last]
+        for cycle in chain(last, self._cycles):
+            self._last = cycle
             if self._offset is None:
                 self._offset = start - float(cycle.stamp)
             at = float(cycle.stamp) + self._offset
             if at >= start:  # the sensor saw the others while the robot was down
-                yield at, cycle
+                yield at, replace(cycle, session=int(cycle.session) + session)
 
 
 class Liar(Protocol):
@@ -185,8 +192,7 @@ class Robot:
             self._ids.update(_whole(cycle.ids))
             self._ids.difference_update(removed)
         self._note_withdrawn(removed)
-        session = self.session or cycle.session
-        return replace(cycle, stamp=stamp, moved=moved, removed=removed, session=session)
+        return replace(cycle, stamp=stamp, moved=moved, removed=removed)
 
     def _note_withdrawn(self, removed: object) -> None:
         """Which issued features the SLAM takes back, as the agent numbers them."""
