@@ -19,7 +19,7 @@ from dagmap.io.settings import NetworkConfig, load_settings
 from dagmap.io.store import Store
 from dagmap.io.transport import Transport
 from dagmap.model import StoreError
-from robots import Nursery, Robot, agreed, record, running, until
+from robots import PATIENCE, Nursery, Robot, agreed, record, running, until
 from scene import agent as scene_agent
 
 KILLS = int(os.environ.get("DAGMAP_KILLS", "20"))
@@ -55,6 +55,11 @@ class Witness:
             self.forks += [event for event in events if isinstance(event, Forked)]
             self.transport.send(self.agent.outbox())
 
+    def wait_for_news(self) -> None:
+        before, deadline = len(self.told), time.monotonic() + PATIENCE
+        while len(self.told) == before and time.monotonic() < deadline:
+            self.watch(0.05)
+
 
 class TestKill:
     def test_kill_at_any_moment_loses_nothing_and_forks_nothing(
@@ -68,8 +73,10 @@ class TestKill:
             robot.start("--speed", 50)
             witness = Witness(robot)
             with witness.transport:
-                for _ in range(KILLS):
-                    witness.watch(rng.uniform(0.05, 0.9))
+                for i in range(KILLS):
+                    if i % 4:  # the others may be killed while they start
+                        witness.wait_for_news()
+                    witness.watch(rng.uniform(0.0, 0.5))
                     robot.kill()
                     witness.watch(0.05)  # what is still under way
                     assert witness.told <= robot.ids(), f"seed {seed}"
@@ -78,7 +85,7 @@ class TestKill:
                 witness.watch(1.0)
                 assert robot.stop() == 0
         assert witness.forks == [], f"seed {seed}"
-        assert len(witness.told) > KILLS  # it did tell, again and again
+        assert len(witness.told) >= KILLS // 2  # it did tell, again and again
         author = robot.identity().author
         restored = robot.restored()
         mine, theirs = (a.ledger.chain(author) for a in (restored, witness.agent))
