@@ -125,9 +125,9 @@ class RayEvidence:
     def judge(
         self, say: Int64s, seed: Int32s, origin: Int32s, first: Int32s, entries: Int32s
     ) -> Int32s:
-        """(N, 6) hits, witnesses, against, distance, passed and hidden of nodes, without arrays of
-        (N, A); see `kernels.bricks.judge`."""
-        out = np.zeros((len(seed), 6), np.int32)
+        """(N, 7) hits, witnesses, against, distance, passed, ended and hidden of nodes, without
+        arrays of (N, A); see `kernels.bricks.judge`."""
+        out = np.zeros((len(seed), 7), np.int32)
         part, touched = np.zeros((self._authors, 4), np.int32), np.zeros(self._authors, np.int32)
         held, cell, limit = self._bricks, self._cell, self._limit
         bricks.judge(held, cell, limit, say, seed, origin, first, entries, part, touched, out)

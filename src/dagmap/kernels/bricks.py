@@ -330,12 +330,12 @@ def _read_cell(bricks: Bricks, e: int, layer: int, at: int, part: Int32s, touche
     count = 0
     while e >= 0:
         free = _counter(bricks.small, bricks.wide, int(bricks.entry[e, PASS + layer]), at)
-        if free > 0:
+        ended = _counter(bricks.small, bricks.wide, int(bricks.entry[e, END + layer]), at)
+        if free > 0 or ended > 0:
             author = int(bricks.entry[e, AUTHOR])
             count = _touch(part, touched, count, author)
-            part[author, PASSED] = free
-            ended = _counter(bricks.small, bricks.wide, int(bricks.entry[e, END + layer]), at)
-            part[author, ENDED] = ended
+            part[author, PASSED] = max(0, free)
+            part[author, ENDED] = max(0, ended)
         e = int(bricks.entry[e, NEXT])
     return count
 
@@ -355,12 +355,13 @@ def _read_ray(
 ) -> int:
     """Ends between the sensor and a node, by author, looked up every half cell of the way.
 
-    Left out is what lies within a cell's edge of either end, in the node's cell, or beyond `limit`.
+    Left out is what lies within a cell's edge of either end, in their cells, or beyond `limit`.
     """
     x, y, z = int(origin[node, 0]), int(origin[node, 1]), int(origin[node, 2])
     dx, dy, dz = int(seed[node, 0]) - x, int(seed[node, 1]) - y, int(seed[node, 2]) - z
     ox, oy, oz = (x + dx) // cell, (y + dy) // cell, (z + dz) // cell
-    lx = ly = lz = bx = by = bz = _NEVER
+    lx, ly, lz = x // cell, y // cell, z // cell  # the cell looked up before
+    bx = by = bz = _NEVER
     first = -1
     for s in range(cell, min(length - cell, limit), max(1, cell // 2)):
         cx, cy, cz = (x + dx * s // length) // cell, (y + dy * s // length) // cell, 0
@@ -401,9 +402,10 @@ def judge(
 ) -> None:
     """What the rays say of every node, each author's part bounded by its say.
 
-    say: (4,) at most of an author's hits, misses, passes and ends before the node. seed, origin,
-    first, entries: see `matching.Nodes`. part: (A, 4) zeros, and zeros again afterwards; touched:
-    (A,). out: (N, 6) is written: hits, witnesses, against, distance, passed, hidden.
+    say: (4,) at most of an author's hits, misses, passes (and as many ends), and ends before the
+    node. seed, origin, first, entries: see `matching.Nodes`. part: (A, 4) zeros, and zeros again
+    afterwards; touched: (A,).
+    out: (N, 7) is written: hits, witnesses, against, distance, passed, ended, hidden.
     """
     top, buckets, brick = bricks.top, bricks.buckets, bricks.brick
     bx = by = bz = _NEVER  # the brick of the node before, most often this one's too
@@ -420,13 +422,14 @@ def judge(
         length = ceil_sqrt(dx * dx + dy * dy + dz * dz)
         count = _read_cell(bricks, newest, cz & 7, at, part, touched)
         count = _read_ray(bricks, cell, limit, origin, seed, node, length, part, touched, count)
-        against = passed = hidden = 0
+        against = passed = ended = hidden = 0
         for k in range(count):
             author = int(touched[k])
             before = int(part[author, BEFORE])
             free = max(0, int(part[author, PASSED]) - int(part[author, ENDED]))
             against += min(int(say[1]), free + before)
             passed += min(int(say[2]), int(part[author, PASSED]))
+            ended += min(int(say[2]), int(part[author, ENDED]))
             hidden += min(int(say[3]), before)
             for column in range(4):
                 part[author, column] = 0
@@ -441,4 +444,5 @@ def judge(
         out[node, 2] = against
         out[node, 3] = length
         out[node, 4] = passed
-        out[node, 5] = hidden
+        out[node, 5] = ended
+        out[node, 6] = hidden
