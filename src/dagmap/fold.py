@@ -217,7 +217,8 @@ class DefaultFold:
     def evaluate(self, rays: RayEvidence) -> Verdict:
         config, n = self._config, len(self)
         found = self._gather(rays, n)
-        record = self._records(weighing.lonely(found))
+        entries = self._nodes.entries[: int(self._nodes.sizes[matching.ENTRIES])]
+        record = weighing.records(found, self._nodes.first[:n], entries, self._authors)
         place = weighing.blocks(self._nodes.seed[:n, :3], 2 * config.cell_mm)
         gone = weighing.gone(found, place, matching.MOMENTS if config.miss_say else 0)
         misses = weighing.misses(found, record, gone, config.delta_mm, config.doubt)
@@ -233,23 +234,6 @@ class DefaultFold:
         say = np.array([self._config.hit_say, self._config.miss_say, *_SAY[1:]], np.int64)
         said = rays.judge(say, nodes.seed[:n], nodes.origin, nodes.first, nodes.entries)
         return weighing.Evidence(*(plain(c) for c in said.T), *(plain(c) for c in around.T))
-
-    def _records(self, lonely: Bools) -> Int64s:
-        """(N,) the record of the most reliable of each node's witnesses."""
-        nodes, authors = self._nodes, self._authors
-        entries = nodes.entries[: int(nodes.sizes[matching.ENTRIES])]
-        observed, discredited = np.zeros(authors, np.int64), np.zeros(authors, np.int64)
-        np.add.at(observed, entries[:, matching.AUTHOR], entries[:, matching.SEEN])
-        alone = entries[nodes.first[: len(lonely)][lonely], matching.AUTHOR]
-        np.add.at(discredited, alone, 1)
-        record = weighing.records(discredited, observed)
-        best = np.full(len(lonely), np.iinfo(np.int64).max)
-        rows, at = np.arange(len(lonely)), nodes.first[: len(lonely)]
-        while len(rows):
-            best[rows] = np.minimum(best[rows], record[entries[at, matching.AUTHOR]])
-            at = entries[at, matching.NEXT]
-            rows, at = rows[at >= 0], at[at >= 0]
-        return best
 
     @property
     def nbytes(self) -> int:

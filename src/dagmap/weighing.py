@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from .kernels.matching import AUTHOR, NEXT, SEEN
 from .model import Bools, Int32s, Int64s
 
 SIXTEENTHS = 16
@@ -52,12 +53,23 @@ def lonely(found: Evidence) -> Bools:
     return np.asarray((found.support <= 1) & (found.against > 0))
 
 
-def records(discredited: Int64s, observed: Int64s) -> Int64s:
-    """What an author's word is discounted by: the share of its observations that are `lonely`.
+def records(found: Evidence, first: Int32s, entries: Int32s, authors: int) -> Int64s:
+    """(N,) what the word of the most reliable of a node's witnesses is discounted by.
 
-    discredited, observed: (A,) observations. Sixteenths of bits; 0 for a clean record.
+    That is the share of its observations that are `lonely`, in sixteenths of bits, 0 for a clean
+    record. first, entries: see `kernels.matching.Nodes`.
     """
-    return log2_16(_PER_SHARE * discredited // np.maximum(observed, 1) + 1)
+    observed, discredited = np.zeros(authors, np.int64), np.zeros(authors, np.int64)
+    np.add.at(observed, entries[:, AUTHOR], entries[:, SEEN])
+    np.add.at(discredited, entries[first[lonely(found)], AUTHOR], 1)
+    record = log2_16(_PER_SHARE * discredited // np.maximum(observed, 1) + 1)
+    best = np.full(len(first), np.iinfo(np.int64).max)
+    rows, at = np.arange(len(first)), first
+    while len(rows):
+        best[rows] = np.minimum(best[rows], record[entries[at, AUTHOR]])
+        at = entries[at, NEXT]
+        rows, at = rows[at >= 0], at[at >= 0]
+    return best
 
 
 def blocks(seed: Int32s, edge: int) -> Int64s:
