@@ -379,18 +379,25 @@ def naive_hidden(rays: NaiveRays, node: Node) -> Counter[int]:
     way = [s - o for s, o in zip(node.seed, node.origin, strict=True)]
     square = sum(d * d for d in way)
     length = isqrt(square - 1) + 1 if square else 0
-    cells: list[Cell] = []
+    cells = [rays.cell_of(node.origin)]
     for s in range(rays.cell, min(length - rays.cell, rays.limit), max(1, rays.cell // 2)):
         x, y, z = (o + d * s // length for o, d in zip(node.origin, way, strict=True))
         cell = rays.cell_of((x, y, z))
         if cell != rays.cell_of(node.seed) and cells[-1:] != [cell]:
             cells.append(cell)
-    return Counter({a: sum(rays.ends[a, c] for c in cells) for a in authors_of(rays)})
+    return Counter({a: sum(rays.ends[a, c] for c in cells[1:]) for a in authors_of(rays)})
+
+
+def cube_of(config: FoldConfig, node: Node) -> Cell:
+    edge, half = 2 * config.cell_mm, 1 << 20
+    x, y, z = (min(max(s // edge, 2 - half), half - 2) for s in node.seed)
+    return (x, y, z)
 
 
 def naive_misses(config: FoldConfig, fold: NaiveMap, rays: NaiveRays) -> list[int]:
     """What counts against each node; see `dagmap.weighing`."""
-    against, support, passed, hidden = [], [], [], []
+    against, support, passed, hidden, brief = [], [], [], [], []
+    excess: Counter[Cell] = Counter()  # by cube of two cells
     for node in fold.nodes:
         cell, before = rays.cell_of(node.seed), naive_hidden(rays, node)
         passes = {a: rays.passes[a, cell] for a in authors_of(rays)}
@@ -401,6 +408,10 @@ def naive_misses(config: FoldConfig, fold: NaiveMap, rays: NaiveRays) -> list[in
         near = [n for n in fold.nodes if distance2(n.seed, node.seed) <= config.support_mm**2]
         parts = sum((n.seen for n in near), Counter[int]())
         support.append(sum(min(16, n) for n in parts.values()))
+        moments = {(a, cycle) for n in near for a, cycle in n.last.items()}
+        brief.append(max(len(moments), *(h for n in near for h in n.hits.values())) < 3)
+        ended = sum(min(32, rays.ends[a, cell]) for a in passes)
+        excess[cube_of(config, node)] += 3 * passed[-1] - 4 * ended
     observed = sum((n.seen for n in fold.nodes), Counter[int]())
     lonely = [n for n, s, a in zip(fold.nodes, support, against, strict=True) if s <= 1 and a > 0]
     discredited = sum((n.seen for n in lonely), Counter[int]())
@@ -413,8 +424,11 @@ def naive_misses(config: FoldConfig, fold: NaiveMap, rays: NaiveRays) -> list[in
         balance += 6 * (naive_log2(length) - naive_log2(config.delta_mm))
         balance -= naive_log2(1 + passed[k]) + 2 * naive_log2(1 + hidden[k])
         balance -= 2 * record + 16 * config.doubt
-        counted = 1 if against[k] == 0 and record > 0 else against[k]
-        out.append(counted if balance <= 0 else 0)
+        x, y, z = cube_of(config, node)
+        around = sum(excess[x + i, y + j, z + h] for i, j, h in product((-1, 0, 1), repeat=3))
+        gone = brief[k] and around > 0 and config.miss_say > 0
+        counted = 1 if against[k] == 0 and (record > 0 or gone) else against[k]
+        out.append(counted if balance <= 0 or gone else 0)
     return out
 
 

@@ -329,6 +329,21 @@ def test_the_record_of_a_witness_tells_on_what_nobody_contradicts() -> None:
     assert fold.evaluate(rays).states[0] == State.CONFIRMED
 
 
+def test_somebody_who_walked_by_is_gone_and_what_was_seen_often_stays() -> None:
+    """A dense patch of one cycle, in space that others then see through."""
+    config = FoldConfig(delta=0.03, cell=0.1, max_ray=5.0)
+    patch = [(1250 + (y * z) % 3, 50 + 31 * y, 50 + 31 * z) for y in range(5) for z in range(5)]
+    for cycles, state in ((1, State.REJECTED), (3, State.TENTATIVE)):
+        rays = RayEvidence(config.cell_mm, config.max_ray_mm)
+        fold = make_fold(config)
+        for k in range(cycles):
+            fold.apply(seen_from_afar(0, 25 * k, patch, rays))
+        for _ in range(8):
+            through = [(2 * x, 2 * y - 50, 2 * z - 50) for x, y, z in patch]
+            walk(rays, 1, [(0, 50, 50)], [0, 25], through)
+        assert set(fold.evaluate(rays).states.tolist()) == {state}
+
+
 def test_support_that_ends_in_the_cell_counts_against_the_own_misses() -> None:
     rays = no_rays()
     fold = applied(EAGER, [block(0, 0, [(10, 10, 10)])])

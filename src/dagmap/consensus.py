@@ -32,6 +32,7 @@ class Component:
 
     fold: Fold
     rays: RayEvidence
+    verdict: Verdict | None = None  # of the nodes as they are, once it was asked for
 
 
 class Consensus:
@@ -119,7 +120,9 @@ class Consensus:
         found = self._components.get(component)
         if found is None or len(found.fold) == 0:
             return None
-        return found.fold.columns(), found.fold.evaluate(found.rays)
+        if found.verdict is None:  # weighed once, however often it is read
+            found.verdict = found.fold.evaluate(found.rays)
+        return found.fold.columns(), found.verdict
 
     def feature_nodes(self, component: FrameId, author: Author) -> Int32s:
         """The node of each feature number of an author in a component, -1 where none."""
@@ -196,7 +199,7 @@ class Consensus:
         while self._applied and self._applied[-1] >= self._mark:
             contribution = self._contributions[self._applied.pop()]
             for part in reversed(contribution.parts):
-                self._components[part.component].fold.undo(contribution.block(part))
+                self._component(part.component).fold.undo(contribution.block(part))
             undone += 1
         self._mark = None
         return undone
@@ -225,7 +228,10 @@ class Consensus:
             )
 
     def _component(self, id_: FrameId) -> Component:
+        """A component that is about to change."""
         found = self._components.get(id_)
+        if found is not None:
+            found.verdict = None
         if found is None:
             fold = self._config.fold
             rays = RayEvidence(fold.cell_mm, fold.max_ray_mm, self._salt)

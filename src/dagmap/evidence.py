@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from .kernels import bricks, rays
+from .kernels import bricks, judging, rays
 from .model import Bools, Int32s, Int64s
 
 D = TypeVar("D", bound=np.generic)
@@ -138,12 +138,12 @@ class RayEvidence:
     def judge(
         self, say: Int64s, seed: Int32s, origin: Int32s, first: Int32s, entries: Int32s
     ) -> Int32s:
-        """(N, 6) hits, witnesses, against, distance, passed and hidden of nodes, without arrays of
-        (N, A); see `kernels.bricks.judge`."""
-        out = np.zeros((len(seed), 6), np.int32)
+        """(N, 7) hits, witnesses, against, distance, passed, ended and hidden of nodes, without
+        arrays of (N, A); see `kernels.judging.judge`."""
+        out = np.zeros((len(seed), 7), np.int32)
         part, touched = np.zeros((self._authors, 4), np.int32), np.zeros(self._authors, np.int32)
         held, cell, limit = self._bricks, self._cell, self._limit
-        bricks.judge(held, cell, limit, say, seed, origin, first, entries, part, touched, out)
+        judging.judge(held, cell, limit, say, seed, origin, first, entries, part, touched, out)
         return out
 
     def _add(self, author: int, sign: int) -> None:

@@ -217,37 +217,23 @@ class DefaultFold:
     def evaluate(self, rays: RayEvidence) -> Verdict:
         config, n = self._config, len(self)
         found = self._gather(rays, n)
-        record = self._records(weighing.lonely(found))
-        misses = weighing.misses(found, record, config.delta_mm, config.doubt)
+        entries = self._nodes.entries[: int(self._nodes.sizes[matching.ENTRIES])]
+        record = weighing.records(found, self._nodes.first[:n], entries, self._authors)
+        place = weighing.blocks(self._nodes.seed[:n, :3], 2 * config.cell_mm)
+        gone = weighing.gone(found, place, matching.MOMENTS if config.miss_say else 0)
+        misses = weighing.misses(found, record, gone, config.delta_mm, config.doubt)
         return _verdict(found.hits, misses, found.witnesses, config.witnesses)
 
     def _gather(self, rays: RayEvidence, n: int) -> weighing.Evidence:
         """What is seen around every node, and what the rays say of it."""
         nodes, authors = self._nodes, self._authors
         part, touched = np.zeros(authors, np.int32), np.zeros(authors, np.int32)
-        support, reach = np.zeros(n, np.int32), self._config.support_mm
-        matching.support(nodes, self._shift, reach, _SAY[0], part, touched, support)
+        around, reach = np.zeros((n, 2), np.int32), self._config.support_mm
+        room = np.zeros((matching.MOMENTS + 1, 2), np.int32)
+        matching.support(nodes, self._shift, reach, _SAY[0], part, touched, room, around)
         say = np.array([self._config.hit_say, self._config.miss_say, *_SAY[1:]], np.int64)
         said = rays.judge(say, nodes.seed[:n], nodes.origin, nodes.first, nodes.entries)
-        hits, witnesses, against, distance, passed, hidden = (plain(c) for c in said.T)
-        return weighing.Evidence(hits, witnesses, against, support, distance, passed, hidden)
-
-    def _records(self, lonely: Bools) -> Int64s:
-        """(N,) the record of the most reliable of each node's witnesses."""
-        nodes, authors = self._nodes, self._authors
-        entries = nodes.entries[: int(nodes.sizes[matching.ENTRIES])]
-        observed, discredited = np.zeros(authors, np.int64), np.zeros(authors, np.int64)
-        np.add.at(observed, entries[:, matching.AUTHOR], entries[:, matching.SEEN])
-        alone = entries[nodes.first[: len(lonely)][lonely], matching.AUTHOR]
-        np.add.at(discredited, alone, 1)
-        record = weighing.records(discredited, observed)
-        best = np.full(len(lonely), np.iinfo(np.int64).max)
-        rows, at = np.arange(len(lonely)), nodes.first[: len(lonely)]
-        while len(rows):
-            best[rows] = np.minimum(best[rows], record[entries[at, matching.AUTHOR]])
-            at = entries[at, matching.NEXT]
-            rows, at = rows[at >= 0], at[at >= 0]
-        return best
+        return weighing.Evidence(*(plain(c) for c in said.T), *(plain(c) for c in around.T))
 
     @property
     def nbytes(self) -> int:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from .kernels.matching import AUTHOR, NEXT, SEEN
 from .model import Bools, Int32s, Int64s
 
 SIXTEENTHS = 16
@@ -19,6 +20,9 @@ _STEPS = np.array(
     [268, 280, 292, 305, 318, 332, 347, 363, 379, 395, 413, 431, 450, 470, 491], np.int64
 )
 _SUPPORT, _DISTANCE, _PASSED, _HIDDEN, _RECORD = 6, 6, 1, 2, 2
+_HALF = 1 << 20
+_STRIDES = np.array([1 << 42, 1 << 21, 1], np.int64)
+_CUBE = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), axis=-1).reshape(-1, 3)
 _PER_SHARE = 200  # the record counts in half percents
 
 
@@ -28,10 +32,12 @@ class Evidence(NamedTuple):
     hits: Int32s  # (N,) see `fold.Verdict`
     witnesses: Int32s
     against: Int32s  # (N,) authors whose evidence speaks against the node, each at most miss_say
-    support: Int32s  # (N,) observations around the node, its own among them
     distance: Int32s  # (N,) mm from the sensor that saw it first
     passed: Int32s  # (N,) transactions with rays through its cell
+    ended: Int32s  # (N,) transactions with points in its cell
     hidden: Int32s  # (N,) ends that lie between that sensor and the node
+    support: Int32s  # (N,) observations around the node, its own among them
+    moments: Int32s  # (N,) in how many cycles those were made at least
 
 
 def log2_16(values: npt.NDArray[np.integer]) -> Int64s:
@@ -47,24 +53,60 @@ def lonely(found: Evidence) -> Bools:
     return np.asarray((found.support <= 1) & (found.against > 0))
 
 
-def records(discredited: Int64s, observed: Int64s) -> Int64s:
-    """What an author's word is discounted by: the share of its observations that are `lonely`.
+def records(found: Evidence, first: Int32s, entries: Int32s, authors: int) -> Int64s:
+    """(N,) what the word of the most reliable of a node's witnesses is discounted by.
 
-    discredited, observed: (A,) observations. Sixteenths of bits; 0 for a clean record.
+    That is the share of its observations that are `lonely`, in sixteenths of bits, 0 for a clean
+    record. first, entries: see `kernels.matching.Nodes`.
     """
-    return log2_16(_PER_SHARE * discredited // np.maximum(observed, 1) + 1)
+    observed, discredited = np.zeros(authors, np.int64), np.zeros(authors, np.int64)
+    np.add.at(observed, entries[:, AUTHOR], entries[:, SEEN])
+    np.add.at(discredited, entries[first[lonely(found)], AUTHOR], 1)
+    record = log2_16(_PER_SHARE * discredited // np.maximum(observed, 1) + 1)
+    best = np.full(len(first), np.iinfo(np.int64).max)
+    rows, at = np.arange(len(first)), first
+    while len(rows):
+        best[rows] = np.minimum(best[rows], record[entries[at, AUTHOR]])
+        at = entries[at, NEXT]
+        rows, at = rows[at >= 0], at[at >= 0]
+    return best
 
 
-def misses(found: Evidence, record: Int64s, delta_mm: int, doubt: int) -> Int32s:
+def blocks(seed: Int32s, edge: int) -> Int64s:
+    """(N,) number of the cube of `edge` mm in which each seed (N, 3) lies, to be told apart from
+    those of its neighbours; beyond 2^20 cubes from the origin all are one."""
+    place = np.clip(seed.astype(np.int64) // edge, 2 - _HALF, _HALF - 2) + _HALF
+    return np.asarray(place @ _STRIDES)
+
+
+def gone(found: Evidence, place: Int64s, lasting: int) -> Bools:
+    """(N,) whether a node was there for a moment, in a part of space that is empty else.
+
+    Seen around it in fewer than `lasting` cycles; and in the 27 cubes about it (`blocks`) rays
+    have passed the nodes' cells a third more often than points have ended there. One ray that
+    grazes an edge does not do that; where somebody has walked by, everything says so.
+    """
+    cubes, at = np.unique(place, return_inverse=True)
+    balance = np.zeros(len(cubes), np.int64)
+    np.add.at(balance, at, 3 * found.passed.astype(np.int64) - 4 * found.ended)
+    around = np.zeros(len(cubes), np.int64)
+    for shift in (_CUBE @ _STRIDES).tolist():
+        other = np.searchsorted(cubes, cubes + shift).clip(max=max(len(cubes) - 1, 0))
+        around += np.where(cubes[other] == cubes + shift, balance[other], 0)
+    return np.asarray((around[at] > 0) & (found.moments < lasting))
+
+
+def misses(found: Evidence, record: Int64s, gone: Bools, delta_mm: int, doubt: int) -> Int32s:
     """(N,) what counts against each node. record: (N,) that of its most reliable witness.
 
     A node is dense around itself where it is real, the denser the nearer its sensor was; it is not
     where rays pass, and nothing lies before it. Only where the balance of that is against a
-    node do the authors who speak against it count; where nobody does, its witness's record does.
+    node, or it is `gone`, do the authors who speak against it count; where nobody does, its
+    witness's record does, or that it is gone.
     """
     spread = log2_16(np.maximum(found.distance, 1)) - log2_16(np.array(delta_mm))
     balance = _SUPPORT * log2_16(np.maximum(found.support, 1)) + _DISTANCE * spread
     balance -= _PASSED * log2_16(1 + found.passed) + _HIDDEN * log2_16(1 + found.hidden)
     balance -= _RECORD * record + SIXTEENTHS * doubt
-    counted = np.where((found.against == 0) & (record > 0), 1, found.against)
-    return np.asarray(np.where(balance <= 0, counted, 0), np.int32)
+    counted = np.where((found.against == 0) & ((record > 0) | gone), 1, found.against)
+    return np.asarray(np.where((balance <= 0) | gone, counted, 0), np.int32)

@@ -1,4 +1,4 @@
-"""Section 4.3, preset `default`: the counters of the ray evidence, and what they say of a node.
+"""Section 4.3, preset `default`: the counters of the ray evidence.
 
 Counters stand in bricks of 8^3 cells: per brick and author eight blocks for `pass` and eight for
 `end`, one for each layer of 8 x 8 cells. A block exists exactly as long as one of its counters is
@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from ..model import Int32s, Int64s
 from .jit import inner, leaf
-from .rays import BRICK, CELLS, ENDS, ENTRY, LOW, ROWS, TOUCHED, ZERO, ZEROED, Marks, ceil_sqrt
+from .rays import BRICK, CELLS, ENDS, ENTRY, LOW, ROWS, TOUCHED, ZERO, ZEROED, Marks
 
 Int8s: TypeAlias = npt.NDArray[np.int8]
 
@@ -28,7 +28,6 @@ LAYERS = 8
 BRICKS, ENTRIES, SMALL, WIDE, FREE_BRICK, FREE_ENTRY, FREE_SMALL, FREE_WIDE, LIVE, KEY = range(10)
 OLDER, FIRST = 3, 4  # columns of Bricks.brick after x y z
 AUTHOR, NEXT, PASS, END = 0, 1, 2, 10  # columns of Bricks.entry; PASS and END: 8 blocks each,
-PASSED, ENDED, BEFORE, LISTED = 0, 1, 2, 3  # columns of what an author says of a node
 NONE = -1  # a small one from 0 up, a wide one from -2 down, or none
 
 
@@ -55,7 +54,7 @@ def _bucket(top: Int64s, mask: int, x: int, y: int, z: int) -> int:
 
 
 @inner
-def _find(top: Int64s, buckets: Int32s, brick: Int32s, x: int, y: int, z: int) -> int:
+def find_brick(top: Int64s, buckets: Int32s, brick: Int32s, x: int, y: int, z: int) -> int:
     b = int(buckets[_bucket(top, buckets.shape[0] - 1, x, y, z)])
     while b >= 0 and (brick[b, 0] != x or brick[b, 1] != y or brick[b, 2] != z):
         b = int(brick[b, OLDER])
@@ -143,7 +142,7 @@ def find_entries(bricks: Bricks, marks: Marks, author: int) -> bool:
     for r in range(rows):
         x, y, z = int(row[r, BRICK]), int(row[r, BRICK + 1]), int(row[r, BRICK + 2])
         x, y, z = x - LOW, y - LOW, z - LOW
-        b = _find(top, buckets, brick, x, y, z)
+        b = find_brick(top, buckets, brick, x, y, z)
         if b < 0:
             b = _new_brick(top, buckets, brick, x, y, z)
         row[r, ENTRY] = _entry(top, brick, entry, b, author)
@@ -234,7 +233,7 @@ def _free_if_zero(top: Int64s, word: Int32s, wide: Int32s, c: int) -> int:
 def _drop(bricks: Bricks, x: int, y: int, z: int, e: int) -> None:
     """Free an entry of a brick, and the brick where it was its last."""
     top, buckets, brick, entry = bricks.top, bricks.buckets, bricks.brick, bricks.entry
-    b = _find(top, buckets, brick, x, y, z)
+    b = find_brick(top, buckets, brick, x, y, z)
     at, before = int(brick[b, FIRST]), -1
     while at != e:
         before, at = at, int(entry[at, NEXT])
@@ -291,7 +290,7 @@ def rebuild(bricks: Bricks) -> None:
 
 
 @inner
-def _counter(small: Int8s, wide: Int32s, c: int, at: int) -> int:
+def count_at(small: Int8s, wide: Int32s, c: int, at: int) -> int:
     if c >= 0:
         return int(small[c, at])
     return 0 if c == NONE else int(wide[-2 - c, at])
@@ -304,141 +303,11 @@ def read(bricks: Bricks, cell: int, xyz: Int32s, passes: Int32s, ends: Int32s) -
     entry, small, wide = bricks.entry, bricks.small, bricks.wide
     for i in range(xyz.shape[0]):
         cx, cy, cz = int(xyz[i, 0]) // cell, int(xyz[i, 1]) // cell, int(xyz[i, 2]) // cell
-        b = _find(top, buckets, brick, cx >> 3, cy >> 3, cz >> 3)
+        b = find_brick(top, buckets, brick, cx >> 3, cy >> 3, cz >> 3)
         e = int(brick[b, FIRST]) if b >= 0 else -1
         at = (cy & 7) << 3 | (cx & 7)
         while e >= 0:
             author = int(entry[e, AUTHOR])
-            passes[i, author] = _counter(small, wide, int(entry[e, PASS + (cz & 7)]), at)
-            ends[i, author] = _counter(small, wide, int(entry[e, END + (cz & 7)]), at)
+            passes[i, author] = count_at(small, wide, int(entry[e, PASS + (cz & 7)]), at)
+            ends[i, author] = count_at(small, wide, int(entry[e, END + (cz & 7)]), at)
             e = int(entry[e, NEXT])
-
-
-@inner
-def _touch(part: Int32s, touched: Int32s, count: int, author: int) -> int:
-    """Put an author on the list of those who say something; how many are on it."""
-    if part[author, LISTED] == 0:
-        part[author, LISTED] = 1
-        touched[count] = author
-        count += 1
-    return count
-
-
-@inner
-def _read_cell(bricks: Bricks, e: int, layer: int, at: int, part: Int32s, touched: Int32s) -> int:
-    """Passes and ends in the cell of a node, by author; how many authors have any."""
-    count = 0
-    while e >= 0:
-        free = _counter(bricks.small, bricks.wide, int(bricks.entry[e, PASS + layer]), at)
-        if free > 0:
-            author = int(bricks.entry[e, AUTHOR])
-            count = _touch(part, touched, count, author)
-            part[author, PASSED] = free
-            ended = _counter(bricks.small, bricks.wide, int(bricks.entry[e, END + layer]), at)
-            part[author, ENDED] = ended
-        e = int(bricks.entry[e, NEXT])
-    return count
-
-
-@inner
-def _read_ray(
-    bricks: Bricks,
-    cell: int,
-    limit: int,
-    origin: Int32s,
-    seed: Int32s,
-    node: int,
-    length: int,
-    part: Int32s,
-    touched: Int32s,
-    count: int,
-) -> int:
-    """Ends between the sensor and a node, by author, looked up every half cell of the way.
-
-    Left out is what lies within a cell's edge of either end, in the node's cell, or beyond `limit`.
-    """
-    x, y, z = int(origin[node, 0]), int(origin[node, 1]), int(origin[node, 2])
-    dx, dy, dz = int(seed[node, 0]) - x, int(seed[node, 1]) - y, int(seed[node, 2]) - z
-    ox, oy, oz = (x + dx) // cell, (y + dy) // cell, (z + dz) // cell
-    lx = ly = lz = bx = by = bz = _NEVER
-    first = -1
-    for s in range(cell, min(length - cell, limit), max(1, cell // 2)):
-        cx, cy, cz = (x + dx * s // length) // cell, (y + dy * s // length) // cell, 0
-        cz = (z + dz * s // length) // cell
-        if (cx == lx and cy == ly and cz == lz) or (cx == ox and cy == oy and cz == oz):
-            continue
-        lx, ly, lz = cx, cy, cz
-        if cx >> 3 != bx or cy >> 3 != by or cz >> 3 != bz:
-            bx, by, bz = cx >> 3, cy >> 3, cz >> 3
-            b = _find(bricks.top, bricks.buckets, bricks.brick, bx, by, bz)
-            first = int(bricks.brick[b, FIRST]) if b >= 0 else -1
-        at = (cy & 7) << 3 | (cx & 7)
-        e = first
-        while e >= 0:
-            c = int(bricks.entry[e, END + (cz & 7)])
-            ended = 0 if c == NONE else _counter(bricks.small, bricks.wide, c, at)
-            if ended > 0:
-                author = int(bricks.entry[e, AUTHOR])
-                count = _touch(part, touched, count, author)
-                part[author, BEFORE] += ended
-            e = int(bricks.entry[e, NEXT])
-    return count
-
-
-@leaf
-def judge(
-    bricks: Bricks,
-    cell: int,
-    limit: int,
-    say: Int64s,
-    seed: Int32s,
-    origin: Int32s,
-    first: Int32s,
-    entries: Int32s,
-    part: Int32s,
-    touched: Int32s,
-    out: Int32s,
-) -> None:
-    """What the rays say of every node, each author's part bounded by its say.
-
-    say: (4,) at most of an author's hits, misses, passes and ends before the node. seed, origin,
-    first, entries: see `matching.Nodes`. part: (A, 4) zeros, and zeros again afterwards; touched:
-    (A,). out: (N, 6) is written: hits, witnesses, against, distance, passed, hidden.
-    """
-    top, buckets, brick = bricks.top, bricks.buckets, bricks.brick
-    bx = by = bz = _NEVER  # the brick of the node before, most often this one's too
-    newest = -1
-    for node in range(out.shape[0]):
-        x, y, z = int(seed[node, 0]), int(seed[node, 1]), int(seed[node, 2])
-        cx, cy, cz = x // cell, y // cell, z // cell
-        if cx >> 3 != bx or cy >> 3 != by or cz >> 3 != bz:
-            bx, by, bz = cx >> 3, cy >> 3, cz >> 3
-            b = _find(top, buckets, brick, bx, by, bz)
-            newest = int(brick[b, FIRST]) if b >= 0 else -1
-        at = (cy & 7) << 3 | (cx & 7)
-        dx, dy, dz = x - int(origin[node, 0]), y - int(origin[node, 1]), z - int(origin[node, 2])
-        length = ceil_sqrt(dx * dx + dy * dy + dz * dz)
-        count = _read_cell(bricks, newest, cz & 7, at, part, touched)
-        count = _read_ray(bricks, cell, limit, origin, seed, node, length, part, touched, count)
-        against = passed = hidden = 0
-        for k in range(count):
-            author = int(touched[k])
-            before = int(part[author, BEFORE])
-            free = max(0, int(part[author, PASSED]) - int(part[author, ENDED]))
-            against += min(int(say[1]), free + before)
-            passed += min(int(say[2]), int(part[author, PASSED]))
-            hidden += min(int(say[3]), before)
-            for column in range(4):
-                part[author, column] = 0
-        h = w = 0
-        mine = int(first[node])
-        while mine >= 0:
-            h += min(int(say[0]), int(entries[mine, 1]))
-            w += 1
-            mine = int(entries[mine, 3])
-        out[node, 0] = h
-        out[node, 1] = w
-        out[node, 2] = against
-        out[node, 3] = length
-        out[node, 4] = passed
-        out[node, 5] = hidden

@@ -21,6 +21,7 @@ X, Y, Z, OLDER = 0, 1, 2, 3  # columns of Nodes.seed; OLDER: next node of the sa
 AUTHOR, HITS, CYCLE, NEXT, SEEN = 0, 1, 2, 3, 4  # columns of Nodes.entries
 NODES, ENTRIES = 0, 1  # places in Nodes.sizes
 FIRST_SEEN = -1  # undo: the observation made the author's entry at the node
+MOMENTS = 3  # as many make a place lasting; more are not told apart
 NOT_COUNTED = -2  # undo: no hit, the author's cycle had counted already
 
 
@@ -249,7 +250,23 @@ def revert(
 
 
 @inner
-def _gather(nodes: Nodes, node: int, part: Int32s, touched: Int32s, count: int) -> int:
+def _meet(moments: Int32s, author: int, cycle: int, hits: int) -> None:
+    """Note a moment, (author, cycle), of which MOMENTS are told apart; row 0 counts them."""
+    known = int(moments[0, 0])
+    new = known < MOMENTS
+    for k in range(1, known + 1):
+        new = new and not (moments[k, 0] == author and moments[k, 1] == cycle)
+    if new:
+        moments[known + 1, 0] = author
+        moments[known + 1, 1] = cycle
+        moments[0, 0] = known + 1
+    moments[0, 1] = max(int(moments[0, 1]), min(hits, MOMENTS))
+
+
+@inner
+def _gather(
+    nodes: Nodes, node: int, part: Int32s, touched: Int32s, moments: Int32s, count: int
+) -> int:
     """Add a node's observations to the parts of their authors; how many are touched now."""
     entry = int(nodes.first[node])
     while entry >= 0:
@@ -259,24 +276,36 @@ def _gather(nodes: Nodes, node: int, part: Int32s, touched: Int32s, count: int) 
             touched[count] = author
             count += 1
         part[author] += seen
+        hits = int(nodes.entries[entry, HITS])
+        _meet(moments, author, int(nodes.entries[entry, CYCLE]), hits)
         entry = int(nodes.entries[entry, NEXT])
     return count
 
 
 @leaf
 def support(
-    nodes: Nodes, shift: int, reach: int, say: int, part: Int32s, touched: Int32s, out: Int32s
+    nodes: Nodes,
+    shift: int,
+    reach: int,
+    say: int,
+    part: Int32s,
+    touched: Int32s,
+    moments: Int32s,
+    out: Int32s,
 ) -> None:
     """Observations in the nodes whose seeds lie within `reach` mm of each node's, at most `say`
     of an author; the node's own among them.
 
-    part: (A,) zeros, and zeros again afterwards; touched: (A,); out: (N,) is written.
+    part: (A,) zeros, and zeros again afterwards; touched: (A,); moments: (MOMENTS + 1, 2).
+    out: (N, 2) is written: the observations, and in how many moments they were made at least:
+    distinct last cycles of the entries or hits of one entry, MOMENTS at most.
     """
     buckets, seed, key = nodes.buckets, nodes.seed, nodes.key
     mask = buckets.shape[0] - 1
     for node in range(out.shape[0]):
         x, y, z = int(seed[node, X]), int(seed[node, Y]), int(seed[node, Z])
         count = 0
+        moments[0, 0] = moments[0, 1] = 0
         for cz in range((z - reach) >> shift, ((z + reach) >> shift) + 1):
             for cy in range((y - reach) >> shift, ((y + reach) >> shift) + 1):
                 for cx in range((x - reach) >> shift, ((x + reach) >> shift) + 1):
@@ -287,14 +316,15 @@ def support(
                         if d2 <= reach * reach and (
                             u >> shift == cx and v >> shift == cy and w >> shift == cz
                         ):  # a bucket may serve two of these cells
-                            count = _gather(nodes, near, part, touched, count)
+                            count = _gather(nodes, near, part, touched, moments, count)
                         near = int(seed[near, OLDER])
         total = 0
         for k in range(count):
             author = int(touched[k])
             total += min(say, int(part[author]))
             part[author] = 0
-        out[node] = total
+        out[node, 0] = total
+        out[node, 1] = max(int(moments[0, 0]), int(moments[0, 1]))
 
 
 @leaf
