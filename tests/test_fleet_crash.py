@@ -155,7 +155,7 @@ class TestMistakes:
             robot.start("--until-agreed", 0.1)
             assert robot.wait() == 0
         robot.ledger.unlink()
-        self._refused(robot, "ledger.db: the ledger of the key beside it is gone", "backup")
+        self._refused(robot, "ledger.db: the ledger of the robot's key is gone", "backup")
         assert not robot.ledger.exists()
 
     def test_a_key_that_others_can_read(self, nursery: Nursery, tmp_path: Path) -> None:

@@ -6,6 +6,8 @@ import json
 import os
 import socket
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -18,7 +20,7 @@ from .transport import Transport
 
 _PATIENCE = 30.0  # s for an answer: an agent that copies a map works on it meanwhile
 _MOST = 64 << 20  # bytes of an answer
-_PATH = 100  # bytes that the path of a socket may have, by the system's tables
+_PATH = 100  # bytes that the address of a socket has room for, and some
 
 
 def report(runtime: Runtime, transport: Transport) -> dict[str, object]:
@@ -92,8 +94,10 @@ class StatusServer:
         self._socket = socket.socket(socket.AF_UNIX)
         mask = os.umask(0o177)
         try:
-            path.unlink(missing_ok=True)  # of a process that was killed; the ledger is ours alone
-            self._socket.bind(_short(path))
+            if path.is_socket():  # of a process that was killed; the ledger is ours alone
+                path.unlink()
+            with _reachable(path) as address:
+                self._socket.bind(address)
             self._socket.listen()
         except OSError as error:
             self._socket.close()
@@ -153,7 +157,8 @@ def ask(path: Path) -> dict[str, Any]:
     with socket.socket(socket.AF_UNIX) as connection:
         connection.settimeout(_PATIENCE + 5)
         try:
-            connection.connect(_short(path))
+            with _reachable(path) as address:
+                connection.connect(address)
             parts, size = [], 0
             while (part := connection.recv(1 << 16)) and size <= _MOST:
                 parts.append(part)
@@ -172,10 +177,14 @@ def ask(path: Path) -> dict[str, Any]:
     return answer
 
 
-def _short(path: Path) -> str:
-    """The path as the system's tables of sockets can hold it."""
-    relative = os.path.relpath(path)
-    best = min(str(path), relative, key=lambda text: len(os.fsencode(text)))
-    if len(os.fsencode(best)) > _PATH:
-        raise OSError(f"the path has more than {_PATH} bytes")
-    return best
+@contextmanager
+def _reachable(path: Path) -> Iterator[str]:
+    """The path as the system's addresses of sockets can hold it: long ones by way of the folder."""
+    if len(os.fsencode(path)) <= _PATH:
+        yield str(path)
+        return
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        yield f"/proc/self/fd/{folder}/{path.name}"
+    finally:
+        os.close(folder)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 
 import msgspec
 import numpy as np
@@ -49,11 +50,14 @@ class Lies(msgspec.Struct, frozen=True, kw_only=True):
 def judge_quality(
     world: WorldMap, walkers: Mapping[str, Walker], honest: Sequence[Robot], scene: Scene
 ) -> Quality | None:
-    """How near the map is to the truth. None where the map or what was seen is empty."""
+    """How near the map is to the truth.
+
+    None where the map or what was seen is empty, or scipy is missing (the extra `evaluate`).
+    """
     seen = [walkers[robot.name].seen().reference for robot in honest if robot.name in walkers]
     reference = np.concatenate([np.zeros((0, 3)), *seen])
     nodes = world.positions[world.kept]
-    if not len(nodes) or not len(reference):
+    if not len(nodes) or not len(reference) or find_spec("scipy") is None:
         return None
     cloud, places = thin(nodes), thin(reference)
     there, back = scene.distance(cloud), nearest(places, cloud)
