@@ -234,6 +234,7 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 C = TypeVar("C", bound=Config)
+T = TypeVar("T")
 
 
 def load_config(path: Path, kind: type[C] = Config) -> C:  # type: ignore[assignment]
@@ -241,6 +242,11 @@ def load_config(path: Path, kind: type[C] = Config) -> C:  # type: ignore[assign
 
     kind: a kind of `Config` with further tables, where the file has them.
     """
+    return read_toml(path, kind)
+
+
+def read_toml(path: Path, kind: type[T]) -> T:
+    """What a TOML file holds, checked. Raises ConfigError as `load_config` does."""
     try:
         return msgspec.toml.decode(path.read_bytes(), type=kind)
     except OSError as error:

@@ -10,7 +10,7 @@ from typing import Literal
 
 import msgspec
 
-from ..config import Config
+from ..config import Config, read_toml
 from ..model import ConfigError
 from .building import SceneConfig
 from .fleet import Crash
@@ -181,16 +181,7 @@ def _drawn_liars(group: Liars, chance: random.Random) -> list[Liars]:
 
 def load_scenario(path: Path) -> Scenario:
     """Read a TOML file. Raises ConfigError that names the file, the key and what is wanted."""
-    try:
-        return msgspec.toml.decode(path.read_bytes(), type=Scenario)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: not a text file in UTF-8") from None
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"{path}: {error}") from None
-    except msgspec.DecodeError as error:
-        raise ConfigError(f"{path}: not valid TOML ({error})") from None
+    return read_toml(path, Scenario)
 
 
 def _differing(value: msgspec.Struct, default: msgspec.Struct) -> dict[str, object]:
