@@ -84,8 +84,14 @@ def test_splitting_what_others_saw_gains_next_to_nothing(seed: int) -> None:
 
 
 def test_one_witness_less_and_it_is_lost() -> None:
-    """Erasers outvote places where honest hits exceed honest misses by no more than they are."""
-    mission, _ = played(room("eraser", 3))
+    """Where nothing but votes counts, erasers outvote places that as many honest ones vouch for.
+
+    By default what lies around a place speaks for it too, and keeps most of these.
+    """
+    scenario = room("eraser", 3)
+    fold = msgspec.structs.replace(scenario.config.fold, doubt=1000)
+    config = msgspec.structs.replace(scenario.config, fold=fold)
+    mission, _ = played(msgspec.structs.replace(scenario, config=config))
     honest = mission.honest
     assert judge_lies(honest[0], honest, liars=3).proven_lost == 0
     assert judge_lies(honest[0], honest, liars=2).proven_lost > 0

@@ -17,7 +17,7 @@ import numpy as np
 
 from .config import Config
 from .contribution import Author, Contribution, Key, Placement
-from .fold import Fold, NodeColumns, RayEvidence, Verdict, make_fold
+from .fold import DefaultFold, Fold, NodeColumns, RayEvidence, Verdict, make_fold
 from .frames import IDENTITY_POSE, place_frames
 from .model import AuthorId, FrameId, Int32s
 from .payload import Anchor
@@ -123,6 +123,13 @@ class Consensus:
         if found.verdict is None:  # weighed once, however often it is read
             found.verdict = found.fold.evaluate(found.rays)
         return found.fold.columns(), found.verdict
+
+    def against(self, component: FrameId) -> Int32s:
+        """(N,) what speaks against each node of a component, whether it counts or not."""
+        found = self._components[component]
+        if isinstance(found.fold, DefaultFold):
+            return found.fold.weigh(found.rays).against
+        return found.fold.evaluate(found.rays).misses
 
     def feature_nodes(self, component: FrameId, author: Author) -> Int32s:
         """The node of each feature number of an author in a component, -1 where none."""

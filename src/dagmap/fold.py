@@ -216,7 +216,7 @@ class DefaultFold:
 
     def evaluate(self, rays: RayEvidence) -> Verdict:
         config, n = self._config, len(self)
-        found = self._gather(rays, n)
+        found = self.weigh(rays)
         entries = self._nodes.entries[: int(self._nodes.sizes[matching.ENTRIES])]
         record = weighing.records(found, self._nodes.first[:n], entries, self._authors)
         place = weighing.blocks(self._nodes.seed[:n, :3], 2 * config.cell_mm)
@@ -224,9 +224,9 @@ class DefaultFold:
         misses = weighing.misses(found, record, gone, config.delta_mm, config.doubt)
         return _verdict(found.hits, misses, found.witnesses, config.witnesses)
 
-    def _gather(self, rays: RayEvidence, n: int) -> weighing.Evidence:
+    def weigh(self, rays: RayEvidence) -> weighing.Evidence:
         """What is seen around every node, and what the rays say of it."""
-        nodes, authors = self._nodes, self._authors
+        nodes, authors, n = self._nodes, self._authors, len(self)
         part, touched = np.zeros(authors, np.int32), np.zeros(authors, np.int32)
         around, reach = np.zeros((n, 2), np.int32), self._config.support_mm
         room = np.zeros((matching.MOMENTS + 1, 2), np.int32)

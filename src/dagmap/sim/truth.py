@@ -12,7 +12,6 @@ import numpy as np
 from ..agent import Agent
 from ..consensus import Consensus
 from ..contribution import Author
-from ..fold import Verdict
 from ..metrics import nearest, thin
 from ..model import AuthorId, Bools, FrameId, Int32s, State
 from ..transaction import Transaction
@@ -40,7 +39,7 @@ class Lies(msgspec.Struct, frozen=True, kw_only=True):
     liars: int
     honest_points: int  # features of honest robots that are in the map without the liars
     honest_lost: int  # of these, rejected with the liars
-    proven_nodes: int  # hits less misses of honest robots exceed the liars' misses, all together
+    proven_nodes: int  # more honest robots saw them than liars and honest ones can speak against
     proven_lost: int  # of these, no observation is in a node that is kept: must be 0
     liars_only: int  # nodes that no honest robot saw
     liars_confirmed: int  # of these, confirmed: must be 0 where `witnesses` exceeds the liars
@@ -92,7 +91,7 @@ def judge_lies(
     was, now = (np.concatenate([np.zeros(0, np.int32), *side]) for side in zip(*pairs, strict=True))
     kept = before.states[was] != State.REJECTED
     lost = kept & (states[now] == State.REJECTED)
-    proven = _proven(before, liars * say)
+    proven = before.hits > alone.against(origin) + liars * say  # whatever misses they add
     survives = np.zeros(len(before.states), np.bool_)
     survives[was[~(states[now] == State.REJECTED)]] = True
     seen = np.zeros(len(before.states), np.bool_)
@@ -107,11 +106,6 @@ def judge_lies(
         liars_confirmed=int(confirmed.sum()),
         false_confirmed=int((confirmed & far).sum()),
     )
-
-
-def _proven(verdict: Verdict, against: int) -> Bools:
-    """Nodes that so many more misses cannot reject."""
-    return np.asarray(verdict.hits - verdict.misses > against)
 
 
 def _honest_fold(agent: Agent, good: set[AuthorId]) -> Consensus:
