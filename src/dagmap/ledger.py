@@ -265,11 +265,16 @@ class Ledger:
             grown = np.zeros(max(end, 2 * len(chain.children)), np.uint8)
             grown[: len(chain.children)] = chain.children
             chain.children = grown
-        numbers, counts = np.unique(bundle.parents[bundle.parents >= 0], return_counts=True)
-        total = chain.children[numbers] + counts
-        if (total > self.config.graph.n_c_max).any():
+        named = bundle.parents[bundle.parents >= 0]
+        if len(named) == 0:
+            return True
+        first = int(named.min())
+        gained = np.bincount(named - first)
+        before = chain.children[first : first + len(gained)]
+        total = before + gained
+        if total.max() > self.config.graph.n_c_max:
             return False
-        chain.children[numbers] = total
+        before[:] = total
         return True
 
     def _count_revocations(self, outcome: Outcome) -> None:
