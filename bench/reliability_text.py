@@ -12,24 +12,28 @@ from typing import Any
 from matplotlib.figure import Figure
 
 BOUND = """\
-It holds for enrolled keys (a closed fleet, `dagmap keys`): in open mode one liar can make as many keys as it likes, and
-no bound holds. Let m robots lie, together and in any way, and let `witnesses` = w, `hit_say` = `miss_say` = 1.
+It holds for enrolled keys (a closed fleet, `dagmap keys`): in open mode one liar can make as
+many keys as it likes, and no bound holds. Let m robots lie, together and in any way, and let
+`witnesses` = w, `hit_say` = `miss_say` = 1.
 
-1. **One map.** Whatever the m do, all honest robots that can reach each other end with one digest, for every m. What is
-   accepted follows from the transactions alone, and a fork is cut at the same number everywhere.
-2. **Nothing invented is confirmed while m < w.** A node is `confirmed` only with w different authors, and only its own
-   key can speak for an author. With m = w liars that say the same it is confirmed: the tests show it.
-3. **A place stays while more honest robots saw it than speak against it, liars included.** Each author counts at most
-   once for and once against a node, and it is rejected only where those against are at least as many. So a node that
-   h honest robots saw and a honest ones speak against survives m liars where h > a + m; with nobody honest
-   against it, m + 1 witnesses are enough. One liar more can reject it, where nothing around it speaks for it: the tests
-   show that too, with the evidence of the neighbourhood switched off (`doubt` = 1000); with it, dense surfaces stay
-   although they are outvoted.
+1. **One map.** Whatever the m do, all honest robots that can reach each other end with one
+   digest, for every m. What is accepted follows from the transactions alone, and a fork is cut
+   at the same number everywhere.
+2. **Nothing invented is confirmed while m < w.** A node is `confirmed` only with w different
+   authors, and only its own key can speak for an author. With m = w liars that say the same it
+   is confirmed: the tests show it.
+3. **A place stays while more honest robots saw it than speak against it, liars included.** Each
+   author counts at most once for and once against a node, and it is rejected only where those
+   against are at least as many. So a node that h honest robots saw and a honest ones speak
+   against survives m liars where h > a + m; with nobody honest against it, m + 1 witnesses are
+   enough. One liar more can reject it, where nothing around it speaks for it: the tests show
+   that too, with the evidence of the neighbourhood switched off (`doubt` = 1000); with it,
+   dense surfaces stay although they are outvoted.
 
-The third is a promise about nodes. A liar that dates back can plant seeds of its own within delta of a place, so that
-the observations of honest robots are shared out among several nodes (the `splitter`): then h counts for each of
-those, and the place is lost only where it fails for all of them. The table has what that gains: next to
-nothing, but not nothing."""
+The third is a promise about nodes. A liar that dates back can plant seeds of its own within
+delta of a place, so that the observations of honest robots are shared out among several nodes
+(the `splitter`): then h counts for each of those, and the place is lost only where it fails for
+all of them. The table has what that gains: next to nothing, but not nothing."""
 
 
 TEXT = """\
