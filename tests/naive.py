@@ -217,6 +217,22 @@ class NaiveMap:
         return min((distance2(self.nodes[k].seed, point), k) for k in where)
 
 
+def naive_settled(
+    config: FoldConfig, blocks: Sequence[Block], author: int, place: Point, repeats: int
+) -> bool:
+    """Whether an author has said of a place what counts, from a fold from scratch."""
+    fold = naive_default(config, blocks)
+    near = fold.nearest(range(len(fold.nodes)), place) if fold.nodes else None
+    if near is None or near[0] > config.delta_mm**2:
+        return False
+    said = Counter[int]()
+    for block in blocks:
+        nodes = fold.features[block.author][block.base : block.base + len(block.xyz)]
+        said[block.author] += sum(node == near[1] for node in nodes)
+    authors = sum(count > 0 for count in said.values())
+    return said[author] >= repeats or (said[author] > 0 and authors >= config.witnesses)
+
+
 def naive_default(config: FoldConfig, blocks: Sequence[Block]) -> NaiveMap:
     """The fold of these blocks from scratch."""
     fold = NaiveMap()

@@ -257,3 +257,48 @@ def test_one_point_and_extreme_points() -> None:
     share(a, b)
     assert a.digest() == b.digest()
     assert len(b.map) == 8
+
+
+class TestRepeats:
+    """A robot that goes its round again and again does not say for ever what it has said."""
+
+    def rounds(self, repeats: int | None, count: int = 12) -> list[int]:
+        issuance = IssuanceConfig(repeats=repeats)
+        robot = agent("a", msgspec.structs.replace(QUICK, issuance=issuance))
+        said = []
+        for k in range(count):
+            events = robot.observe(look(float(k)), float(k))
+            robot.tick(k + 0.5)
+            said.append(sum(event.features for event in events if isinstance(event, Issued)))
+        return said
+
+    def test_what_was_said_often_enough_is_not_said_again(self) -> None:
+        said = self.rounds(repeats=3)
+        assert min(said[:3]) > 0 and sum(said[4:]) == 0
+
+    def test_unless_it_is_to_say_everything(self) -> None:
+        assert min(self.rounds(repeats=None)) > 0
+
+    def test_what_the_fleet_confirms_is_said_once(self) -> None:
+        graph = msgspec.structs.replace(QUICK.graph, v_th=1)
+        a, b = (agent(name, msgspec.structs.replace(QUICK, graph=graph)) for name in "ab")
+        for robot in (a, b):
+            robot.observe(look(0.0), 0.0)
+        share(a, b)
+        a.tick(0.5)
+        events = a.observe(look(1.0), 1.0)
+        assert not any(event.features for event in events if isinstance(event, Issued))
+        assert len(a.observing.graph) == len(WALL), "the graph does not grow either"
+
+    def test_what_is_withdrawn_is_worth_saying_again(self) -> None:
+        issuance = IssuanceConfig(repeats=1)
+        robot = agent("a", msgspec.structs.replace(QUICK, issuance=issuance))
+        ids = np.arange(len(WALL))
+        robot.observe(look(0.0, ids=ids), 0.0)
+        robot.tick(0.5)
+        robot.observe(look(1.0, ids=ids + 1000), 1.0)  # known: left out, its ids kept in mind
+        robot.observe(look(2.0, WALL[:0], removed=ids + 1000), 2.0)
+        robot.observe(look(3.0, WALL[:0], removed=ids), 3.0)
+        robot.tick(3.5)
+        events = robot.observe(look(4.0, ids=ids + 2000), 4.0)
+        assert any(event.features for event in events if isinstance(event, Issued))

@@ -18,7 +18,16 @@ from dagmap.fold import Block, Fold, NodeColumns, PaperFold, Verdict, make_fold
 from dagmap.kernels.rays import ceil_sqrt
 from dagmap.model import LIMIT_MM, State
 from dagmap.weighing import log2_16
-from naive import NaiveMap, NaiveRays, naive_default, naive_log2, naive_paper, naive_verdict, points
+from naive import (
+    NaiveMap,
+    NaiveRays,
+    naive_default,
+    naive_log2,
+    naive_paper,
+    naive_settled,
+    naive_verdict,
+    points,
+)
 
 COMPILED = not numba.config.DISABLE_JIT
 SOME = settings(max_examples=100 if COMPILED else 40, deadline=None)
@@ -179,6 +188,24 @@ def test_undo_is_the_exact_inverse(
                 assert state_of(fold) == states[done]
         if data.draw(st.integers(0, 30)) == 0:
             break
+
+
+@FEW
+@given(blocks=stories(most=6), repeats=st.integers(1, 3), author=st.integers(0, 2))
+def test_settled_is_what_was_said_often_enough(
+    blocks: list[Block], repeats: int, author: int
+) -> None:
+    """By the author itself, or once where enough others say it too."""
+    fold = applied(DEFAULT, blocks)
+    seen = np.concatenate([np.zeros((1, 3), np.int32), *(b.xyz for b in blocks)])
+    wanted = [naive_settled(DEFAULT, blocks, author, p, repeats) for p in points(seen)]
+    assert fold.settled(author, seen, repeats).tolist() == wanted
+
+
+def test_algorithm_2_wants_to_hear_everything() -> None:
+    blocks = [block(0, 0, [(0, 0, 0)] * 3), block(1, 0, [(0, 0, 0)])]
+    fold = applied(PAPER, blocks)
+    assert not fold.settled(0, blocks[0].xyz, 1).any()
 
 
 @BOTH

@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from . import checkpoint as checkpoints
 from . import messages
 from .config import Config
@@ -20,12 +22,14 @@ from .model import (
     FLEET_FRAME,
     Accepted,
     AuthorId,
+    Bools,
     ConfigError,
     Cycle,
     Event,
     Floats,
     Forked,
     FrameId,
+    Int32s,
     Issued,
     MapChanged,
     Outgoing,
@@ -105,7 +109,7 @@ class Agent:
         """Take one cycle of the local SLAM. Raises CycleError, and then nothing was taken."""
         quantised = self.observing.check(quantise_cycle(cycle))
         self.observing.withdraw(quantised)  # what the SLAM removed or moved
-        self.observing.insert(quantised, now)  # what it added: Alg. 1
+        self.observing.insert(quantised, now, self._settled)  # what it added: Alg. 1
         return self._issue(now)
 
     def receive(self, data: bytes, now: float) -> list[Event]:
@@ -202,6 +206,13 @@ class Agent:
         self.sync = Sync(self.ledger, self.config, self.identity.author)
         self.ledger.changed.update(self.ledger.chains)  # nobody has read them in this process
         return list(stored.values())[held:]
+
+    def _settled(self, points: Int32s) -> Bools:
+        """Points (N, 3) mm in the SLAM frame that the map knows from this robot well enough."""
+        repeats = self.config.issuance.repeats
+        if repeats is None:
+            return np.zeros(len(points), np.bool_)
+        return self.consensus.settled(*self._frame, points, repeats)
 
     def _issue(self, now: float) -> list[Event]:
         """Section 4.2: seal what is valid and may go out, and take it through the door."""

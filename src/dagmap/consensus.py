@@ -19,7 +19,8 @@ from .config import Config
 from .contribution import Author, Contribution, Key, Placement
 from .fold import DefaultFold, Fold, NodeColumns, RayEvidence, Verdict, make_fold
 from .frames import IDENTITY_POSE, place_frames
-from .model import AuthorId, FrameId, Int32s
+from .kernels.geometry import apply_pose
+from .model import AuthorId, Bools, FrameId, Int32s
 from .payload import Anchor
 from .transaction import Transaction
 
@@ -123,6 +124,16 @@ class Consensus:
         if found.verdict is None:  # weighed once, however often it is read
             found.verdict = found.fold.evaluate(found.rays)
         return found.fold.columns(), found.verdict
+
+    def settled(self, author: AuthorId, session: int, points: Int32s, repeats: int) -> Bools:
+        """(N,) points (N, 3) mm in an author's SLAM frame of which it has said all that counts."""
+        component, pose = self.placement(author, session)
+        found, known = self._components.get(component), self.authors.get(author)
+        if found is None or known is None:
+            return np.zeros(len(points), np.bool_)
+        placed, inside = np.empty_like(points), np.ones(len(points), np.bool_)
+        apply_pose(pose, points, placed, inside)
+        return found.fold.settled(known.index, placed, repeats) & inside
 
     def against(self, component: FrameId) -> Int32s:
         """(N,) what speaks against each node of a component, whether it counts or not."""

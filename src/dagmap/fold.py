@@ -109,6 +109,10 @@ class Fold(Protocol):
     def columns(self) -> NodeColumns:
         """The nodes, in the order in which they came into being."""
 
+    def settled(self, author: int, xyz: Int32s, repeats: int) -> Bools:
+        """(N,) places (N, 3) mm of which the author has said all that counts: it said so
+        `repeats` times, or once where as many authors as confirm a node say the same."""
+
     def evaluate(self, rays: RayEvidence) -> Verdict:
         """Hits, misses, witnesses and states of all nodes."""
 
@@ -213,6 +217,14 @@ class DefaultFold:
 
     def columns(self) -> NodeColumns:
         return _columns(self._nodes, len(self))
+
+    def settled(self, author: int, xyz: Int32s, repeats: int) -> Bools:
+        out = np.zeros(len(xyz), np.bool_)
+        witnesses = self._config.witnesses
+        matching.settled(
+            self._nodes, self._shift, self._reach, author, plain(xyz), repeats, witnesses, out
+        )
+        return out
 
     def evaluate(self, rays: RayEvidence) -> Verdict:
         config, n = self._config, len(self)
@@ -322,6 +334,9 @@ class PaperFold:
     def parents(self) -> Int32s:
         """(N, P) nodes that each node refers to, -1 none; read-only."""
         return _view(self._graph.parents, len(self))
+
+    def settled(self, author: int, xyz: Int32s, repeats: int) -> Bools:
+        return np.zeros(len(xyz), np.bool_)  # in Algorithm 2 every observation counts
 
     def evaluate(self, rays: RayEvidence) -> Verdict:
         graph, n = self._graph, len(self)

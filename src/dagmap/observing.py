@@ -3,8 +3,9 @@ retractions, and in the end the payloads of its transactions (sections 4.1 and 4
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +29,7 @@ from .model import (
 from .payload import Anchor, Link, Payload, Sighting
 from .transaction import Transaction
 
+Settled: TypeAlias = Callable[[Int32s], Bools]  # of points (N, 3) mm in the SLAM frame
 CERTAIN = (1 << 31) - 1  # inliers of a link that was configured, not measured
 _ROOM = 50_000  # bytes of records in a transaction; below, what each costs at most
 _FEATURE, _PARENT, _ANCHOR, _NUMBER, _SIGHTING = 22, 6, 48, 6, 16
@@ -117,8 +119,11 @@ class Observing:
         for stamp, pose in cycle.moved:
             self._move(self._cycle_of[stamp], stamp, pose, names)
 
-    def insert(self, cycle: QuantisedCycle, now: float) -> None:
-        """Algorithm 1 for every new feature of the cycle, in the order of a Z curve."""
+    def insert(self, cycle: QuantisedCycle, now: float, settled: Settled) -> None:
+        """Algorithm 1 for every new feature of the cycle, in the order of a Z curve.
+
+        settled: tells which points the map knows well enough; these are left out.
+        """
         number, self.cycles = self.cycles, self.cycles + 1
         self._sessions[cycle.session] = cycle.stamp
         self._cycle_of[cycle.stamp] = number
@@ -127,8 +132,13 @@ class Observing:
         order = morton_order(cycle.points)
         if cycle.ids is not None:
             order = self._first_seen(cycle.ids, order, number)
+        positions = _carry(cycle.pose, cycle.points[order])[0]
+        fresh = ~settled(positions)
+        if cycle.ids is not None:
+            self._nodes.update(dict.fromkeys(cycle.ids[order[~fresh]].tolist(), -1))
+        order = order[fresh]
         place = cycle.points[order]
-        nodes = self.graph.insert(_carry(cycle.pose, place)[0])
+        nodes = self.graph.insert(positions[fresh])
         color = np.zeros((len(place), 3), np.uint8) if cycle.colors is None else cycle.colors[order]
         colored = np.full(len(place), cycle.colors is not None, np.bool_)
         self.issuance.add(nodes, np.full(len(place), number, np.int32), place, color, colored)

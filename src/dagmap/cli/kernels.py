@@ -83,6 +83,7 @@ def warm_fold() -> None:
     fold.apply(block)
     rays.walk(0, origins, starts, places, alive, 1)
     fold.evaluate(rays)
+    fold.settled(0, places, 1)
     rays.walk(0, origins, starts, places, alive, -1)  # else the first fork would wait for it
     fold.undo(block)
     rays.walk(0, origins, starts, places, alive, -1)  # frees what has become zero

@@ -328,6 +328,35 @@ def support(
 
 
 @leaf
+def settled(
+    nodes: Nodes,
+    shift: int,
+    reach: int,
+    author: int,
+    xyz: Int32s,
+    repeats: int,
+    witnesses: int,
+    out: Bools,
+) -> None:
+    """Whether what an author would say of each place adds nothing that counts.
+
+    It has said it `repeats` times, or once where as many authors as are wanted say it.
+    """
+    for i in range(xyz.shape[0]):
+        x, y, z = int(xyz[i, 0]), int(xyz[i, 1]), int(xyz[i, 2])
+        node = find_twin(nodes, shift, reach, x, y, z)
+        own = 0
+        authors = 0
+        entry = int(nodes.first[node]) if node >= 0 else -1
+        while entry >= 0:
+            authors += 1
+            if int(nodes.entries[entry, AUTHOR]) == author:
+                own = int(nodes.entries[entry, SEEN])
+            entry = int(nodes.entries[entry, NEXT])
+        out[i] = own >= repeats or (own > 0 and authors >= witnesses)
+
+
+@leaf
 def rebuild(nodes: Nodes, shift: int) -> None:
     """Fill a new, empty array of buckets (all -1); chains come out the newest first again."""
     mask = nodes.buckets.shape[0] - 1
