@@ -262,7 +262,7 @@ def test_one_point_and_extreme_points() -> None:
 class TestRepeats:
     """A robot that goes its round again and again does not say for ever what it has said."""
 
-    def rounds(self, repeats: int | None, count: int = 12) -> list[int]:
+    def rounds(self, repeats: int, count: int = 12) -> list[int]:
         issuance = IssuanceConfig(repeats=repeats)
         robot = agent("a", msgspec.structs.replace(QUICK, issuance=issuance))
         said = []
@@ -277,7 +277,7 @@ class TestRepeats:
         assert min(said[:3]) > 0 and sum(said[4:]) == 0
 
     def test_unless_it_is_to_say_everything(self) -> None:
-        assert min(self.rounds(repeats=None)) > 0
+        assert min(self.rounds(repeats=0)) > 0
 
     def test_what_the_fleet_confirms_is_said_once(self) -> None:
         graph = msgspec.structs.replace(QUICK.graph, v_th=1)

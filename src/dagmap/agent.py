@@ -210,7 +210,7 @@ class Agent:
     def _settled(self, points: Int32s) -> Bools:
         """Points (N, 3) mm in the SLAM frame that the map knows from this robot well enough."""
         repeats = self.config.issuance.repeats
-        if repeats is None:
+        if not repeats:
             return np.zeros(len(points), np.bool_)
         return self.consensus.settled(*self._frame, points, repeats)
 

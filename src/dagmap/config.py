@@ -72,15 +72,14 @@ class IssuanceConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=
     features_per_bundle: int = 1400  # N'_f: what a bundle holds at most; the furthest are cut
     features_per_transaction: int = 1400  # so that a transaction fits in one message
     features_per_second: float | None = None  # the robot's budget; None: as fast as they are valid
-    repeats: int | None = 16  # how often a robot says that it saw one place; None: every time
+    repeats: int = 16  # how often a robot says that it saw one place; 0: every time
     seal_period: float = 0.25  # s between transactions under a budget, so that envelopes stay few
 
     def __post_init__(self) -> None:
         self._require_range("features_per_bundle", 1, 1 << 20)
         self._require_range("features_per_transaction", 1, 1400)
         self._require_range("seal_period", 0.0, 3600.0)
-        if self.repeats is not None:
-            self._require_range("repeats", 1, 1 << 30)
+        self._require_range("repeats", 0, 1 << 30)
         if self.features_per_second is not None:
             self._require_range("features_per_second", 0.1, 1e9)
 
