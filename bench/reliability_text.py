@@ -26,9 +26,9 @@ many keys as it likes, and no bound holds. Let m robots lie, together and in any
    author counts at most once for and once against a node, and it is rejected only where those
    against are at least as many. So a node that h honest robots saw and a honest ones speak
    against survives m liars where h > a + m; with nobody honest against it, m + 1 witnesses are
-   enough (m at least 1). One liar more can reject it, where nothing around it speaks for it: the tests show
-   that too, with the evidence of the neighbourhood switched off (`doubt` = 1000); with it,
-   dense surfaces stay although they are outvoted.
+   enough (m at least 1). One liar more can reject it, where nothing around it speaks for it: the
+   tests show that too, with the evidence of the neighbourhood switched off (`doubt` = 1000);
+   with it, dense surfaces stay although they are outvoted.
 
 The third is a promise about nodes. A liar that dates back can plant seeds of its own within
 delta of a place, so that the observations of honest robots are shared out among several nodes
