@@ -94,7 +94,7 @@ def draw(tracks: list[Track], rss: list[float], path: Path) -> None:
         ((1, 0), "sent by a robot, kB a minute", [np.array(t.traffic) / 1e3 for t in tracks]),
         (
             (1, 1),
-            "95 % of cycles take less, ms of processor",
+            "p95 of a cycle, ms of processor",
             [np.array(t.cycle_ms) for t in tracks],
         ),
     ):
