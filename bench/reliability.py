@@ -253,17 +253,32 @@ def measure(options: argparse.Namespace, tell: Tell) -> dict[str, Any]:
     def about(what: str) -> Callable[[float], None]:
         return lambda share: tell(what, share)
 
-    jobs = options.jobs
-    return {
-        "busy": busy(about("messages a second")),
-        "hundred": long_run("hundred", options.seconds, about("a hundred robots")),
-        "hour": long_run("hour", options.seconds, about("an hour apart")),
-        "divergence": troubled(about("divergence")),
-        "loss": lossy(LOSSES, options.runs, jobs, about("loss")),
-        "liars": lying(max(1, options.runs // 10), jobs, about("liars")),
-        "sweep": swept(options.seeds, jobs, about("sweep")),
-        "fuzz_executions": fuzzed(),
+    jobs, runs = options.jobs, options.runs
+    parts: dict[str, Callable[[], Any]] = {
+        "busy": lambda: busy(about("messages a second")),
+        "hundred": lambda: long_run("hundred", options.seconds, about("a hundred robots")),
+        "hour": lambda: long_run("hour", options.seconds, about("an hour apart")),
+        "divergence": lambda: troubled(about("divergence")),
+        "loss": lambda: lossy(LOSSES, runs, jobs, about("loss")),
+        "liars": lambda: lying(max(1, runs // 10), jobs, about("liars")),
+        "sweep": lambda: swept(options.seeds, jobs, about("sweep")),
     }
+    figures = {name: kept(options, name, part) for name, part in parts.items()}
+    return figures | {"fuzz_executions": fuzzed()}
+
+
+def kept(options: argparse.Namespace, name: str, part: Callable[[], Any]) -> Any:
+    """What a part gave, from the file of an interrupted run with the same options where it may."""
+    asked = {"seeds": options.seeds, "runs": options.runs, "seconds": options.seconds}
+    path = options.parts / f"{name}.json"
+    if path.exists():
+        held = json.loads(path.read_text())
+        if held["asked"] == asked:
+            return held["figures"]
+    figures = part()
+    options.parts.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({"asked": asked, "figures": figures}))
+    return json.loads(path.read_text())["figures"]
 
 
 def main() -> None:
@@ -273,6 +288,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, help="shorten the long missions, for a look")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
     parser.add_argument("--out", type=Path, default=ROOT / "docs", help="folder of the document")
+    parser.add_argument(
+        "--parts",
+        type=Path,
+        default=ROOT / "out" / "reliability",
+        help="what is done is kept here; remove it to measure anew",
+    )
     parser.add_argument("--json", action="store_true", help="print all figures as well")
     options = parser.parse_args()
     with Progress(console=_stderr()) as progress:
