@@ -34,7 +34,7 @@ def _inside(node: ast.AST, name: str, left_out: tuple[str, ...]) -> Iterator[tup
     for child in ast.iter_child_nodes(node):
         if isinstance(child, (ast.FunctionDef, ast.ClassDef)):
             inner = f"{name}.{child.name}" if name else child.name
-            if not any(fnmatch(inner, pattern) for pattern in left_out):
+            if not _left_out(inner, left_out):
                 yield from _inside(child, inner, left_out)
             continue
         in_function = name and not isinstance(node, ast.ClassDef)
@@ -43,10 +43,20 @@ def _inside(node: ast.AST, name: str, left_out: tuple[str, ...]) -> Iterator[tup
         yield from _inside(child, name, left_out)
 
 
+def _left_out(name: str, patterns: tuple[str, ...]) -> bool:
+    """Patterns that begin with "!" name what alone is counted."""
+    kept = [pattern[1:] for pattern in patterns if pattern.startswith("!")]
+    if kept:
+        return not any(fnmatch(name, pattern) for pattern in kept)
+    return any(fnmatch(name, pattern) for pattern in patterns)
+
+
 def _runs(statement: ast.stmt) -> bool:
-    """Whether a statement has code of its own: docstrings, `try` and `while True` have none."""
+    """Whether a statement has code of its own: not docstrings, `try`, bare types."""
     if isinstance(statement, ast.Expr):
         return not isinstance(statement.value, ast.Constant)
+    if isinstance(statement, ast.AnnAssign):
+        return statement.value is not None
     if isinstance(statement, ast.While):
         return not isinstance(statement.test, ast.Constant)
     return not isinstance(statement, (ast.Try, ast.Pass, ast.Global, ast.Nonlocal))

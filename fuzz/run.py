@@ -36,11 +36,19 @@ LIMITS = (
 )
 
 SHARES = {"message": 500, "ply": 160, "records": 130, "config": 110, "envelope": 40, "npz": 20}
-SHARES |= {"store": 12, "tum": 16, "columns": 8, "agent": 4}
+SHARES |= {"store": 12, "tum": 16, "columns": 8, "agent": 4, "closed": 40, "closed_agent": 4}
 _PURE = ("kernels.codec", "kernels.rangecoder")
 _COMPILED = ("wire", "messages", "payload", "transaction", "config", "ledger", "sync", "agent")
 _COMPILED += ("io.sources._source", "io.sources._rgbd", "io.sources.npz", "io.sources.tum")
-_COMPILED += ("io.export", "io.store")
+_COMPILED += (
+    "io.export",
+    "io.ply",
+    "io.clouds",
+    "io.npy",
+    "io.store",
+    "io.settings",
+    "sim.scenario",
+)
 
 
 def main() -> None:

@@ -18,13 +18,20 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from random import Random
+from typing import Any
 
+import msgspec
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 import targets
+from dagmap.config import Config, FoldConfig
+from dagmap.io.settings import load_settings
+from dagmap.messages import parse
+from dagmap.model import ConfigError
 from dagmap.payload import Kind, encode_payload
-from dagmap.wire import Reader
+from dagmap.wire import Reader, Refusal
 from grammar import flipper, rest, tree
 from targets import _wire, tum
 
@@ -32,6 +39,8 @@ ROOT = Path(__file__).parents[1]
 NAMES = targets.names()
 MUTATIONS = {
     "agent": 150,
+    "closed": 1000,
+    "closed_agent": 150,
     "columns": 1500,
     "envelope": 1000,
     "npz": 1500,
@@ -149,6 +158,25 @@ def ledger(tmp_path: Path, script: str) -> bytes:
     return path.read_bytes()
 
 
+def cloud(**changed: npt.NDArray[Any] | bytes) -> bytes:
+    """A cloud of two points; bytes stand for the whole of a member."""
+    arrays: dict[str, Any] = {"points": np.ones((2, 3))}
+    out = io.BytesIO()
+    np.savez(out, **(arrays | {k: v for k, v in changed.items() if not isinstance(v, bytes)}))
+    with zipfile.ZipFile(out, "a") as archive:
+        for name, data in changed.items():
+            if isinstance(data, bytes):
+                archive.writestr(f"{name}.npy", data)
+    return out.getvalue()
+
+
+def ascii_cloud(*lines: str) -> bytes:
+    fields = "".join(f"property float {name}\n" for name in ("x", "y", "z", "state"))
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(lines)}\n{fields}end_header\n"
+    return (head + "\n".join(lines)).encode()
+
+
+POSE = np.eye(4)[None]
 FOUND: dict[str, tuple[str, Callable[[], bytes]]] = {
     "a number of 5000 digits": ("config", lambda: b"name = " + b"9" * 5000),
     "arrays in arrays": ("config", lambda: b"name = " + b"[" * 3000),
@@ -174,6 +202,27 @@ FOUND: dict[str, tuple[str, Callable[[], bytes]]] = {
         "tum",
         lambda: folder(associations_txt=b"1 rgb/1.0.png 1 " + b"x" * 300),
     ),
+    "a home of nobody": ("config", lambda: b"store.path = '~nobody-at-all/x.db'"),
+    "a path with a zero": ("config", lambda: b'store.path = "a\\u0000b"'),
+    "a path that no file may have": ("config", lambda: b'store.path = "%s"' % (b"x" * 5000)),
+    "faults without end": ("config", lambda: b"chaos.crashes = 4611686018427387905"),
+    "faults that last for ever": (
+        "config",
+        lambda: b"chaos.crashes = 1\nchaos.down = [inf, inf]",
+    ),
+    "a cloud's unfinished header": (
+        "ply",
+        lambda: cloud(states=header("{'descr': '|u1', (") + bytes(2)),
+    ),
+    "a cloud's header with a list as key": ("ply", lambda: cloud(states=header("{[]: 1}"))),
+    "a cloud's member that is no array": ("ply", lambda: cloud(states=b"text")),
+    "a cloud packed by LZMA": ("ply", lambda: damaged(zipfile.ZIP_LZMA)),
+    "states that are no numbers": ("ply", lambda: cloud(states=np.full(2, np.nan))),
+    "offsets that are one number": ("ply", lambda: cloud(pose=POSE, offsets=np.array(2))),
+    "offsets in rows": ("ply", lambda: cloud(pose=POSE, offsets=np.zeros((2, 2), np.int64))),
+    "offsets that end early": ("ply", lambda: cloud(pose=POSE, offsets=np.array([0, 1]))),
+    "a vertex whose state is infinite": ("ply", lambda: ascii_cloud("1 2 3 1e300")),
+    "a vertex that is a comment": ("ply", lambda: ascii_cloud("# 1 2 3")),
 }
 LEDGERS = {
     "a ledger of no fleet": "DELETE FROM meta WHERE key = 'fleet'",
@@ -231,7 +280,7 @@ assert not late, late
     assert done.returncode == 0, done.stderr[-2000:]
 
 
-@pytest.mark.parametrize("name", ["message", "records", "envelope", "agent", "columns"])
+@pytest.mark.parametrize("name", ["message", "records", "envelope", "closed", "agent", "columns"])
 def test_trees_lose_nothing(name: str) -> None:
     """A mutation that changes nothing is the input: so what a tree leaves alone stays in order."""
     grammars = {
@@ -254,9 +303,33 @@ def test_every_kind_of_record_has_a_grammar_and_a_sample() -> None:
     assert set(_wire.RECORDS) == kinds == set(Kind), "a new kind belongs into targets/_wire.py"
 
 
+def test_the_corpus_does_not_follow_the_defaults() -> None:
+    """What was found once stays of use: another default or parameter is no other fleet."""
+    other = msgspec.structs.replace(_wire.CONFIG, fold=FoldConfig(witnesses=9, delta=0.5))
+    assert Config(fold=other.fold).parameters_id != Config().parameters_id
+    for data in targets.corpus("message"):
+        assert heard(data, other) == heard(data, _wire.CONFIG)
+
+
+def heard(data: bytes, config: Config) -> bool:
+    try:
+        parse(data, config)
+    except Refusal:
+        return False
+    return True
+
+
+def test_a_file_whose_name_no_robot_may_have_is_refused(tmp_path: Path) -> None:
+    """The one way out of `load_settings` that no bytes lead to."""
+    path = tmp_path / f"{'x' * 70}.toml"
+    path.write_text("store.path = 'a'")
+    with pytest.raises(ConfigError, match="give the robot a `name`"):
+        load_settings(path)
+
+
 def test_the_corpus_is_small_and_named_by_content() -> None:
     files = [path for path in targets.CORPUS.rglob("*") if path.is_file()]
-    assert sum(path.stat().st_size for path in files) < 300_000
+    assert sum(path.stat().st_size for path in files) < 400_000
     for path in files:
         assert path.name == hashlib.sha1(path.read_bytes(), usedforsecurity=False).hexdigest()
 

@@ -9,13 +9,14 @@ from __future__ import annotations
 import zlib
 from random import Random
 
+import msgspec
 import numpy as np
 
-from dagmap import messages, payload, transaction
-from dagmap.config import Config, TransactionConfig
+from dagmap import identity, messages, payload, transaction
+from dagmap.config import Config, GraphConfig, TransactionConfig
 from dagmap.identity import Identity
 from dagmap.model import FLEET_FRAME, LIMIT_MM, FrameId, quantise_pose
-from dagmap.payload import Anchor, Bundle, Kind, Link, Payload, Sighting
+from dagmap.payload import Anchor, Bundle, Kind, Link, Payload, Revocation, Sighting
 from dagmap.transaction import id_of
 from dagmap.wire import Reader, Refusal
 from grammar import (
@@ -39,12 +40,42 @@ from grammar import (
     when,
 )
 
-CONFIG = Config(transaction=TransactionConfig(proof_of_work_bits=1))
-ROBOTS = [Identity.from_seed(bytes([i]) * 32) for i in range(3)]
-_BY_KEY = {robot.public_key: robot for robot in ROBOTS}
+
+class FuzzConfig(Config, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """With one id of the parameters for good: else the corpus would be refused, message by
+    message and unnoticed, whenever a default changes or a parameter comes.
+    """
+
+    @property
+    def parameters_id(self) -> bytes:
+        return bytes.fromhex("02f561876e12c44b")
+
+
+CONFIG = FuzzConfig(  # whatever judges a transaction is fixed too
+    fleet="dagmap",
+    graph=GraphConfig(n_p=2, n_c=2, n_c_max=8),
+    transaction=TransactionConfig(proof_of_work_bits=1, max_references=2),
+)
+AUTHORITY = Identity.from_seed(bytes([9]) * 32)  # the key of the closed fleet
+CLOSED = msgspec.structs.replace(CONFIG, fleet_key=AUTHORITY.public_key.hex())
+_OPEN = [Identity.from_seed(bytes([i]) * 32) for i in range(3)]
+ROBOTS = [
+    Identity.from_seed(
+        bytes([i]) * 32, AUTHORITY.certify(CLOSED.fleet_id, robot.public_key, f"robot{i}")
+    )
+    for i, robot in enumerate(_OPEN)
+]
+_BY_KEY = {robot.public_key: robot for robot in (*ROBOTS, AUTHORITY)}
 _POSE = quantise_pose(np.eye(4))
 
 _FRAME = record(raw(8), number)
+
+
+def _certificate(reader: Reader, _: list[Node]) -> Node:
+    data = reader.take(reader.left)
+    return Branch("list", [Leaf("raw", data[:-64]), Leaf("raw", data[-64:])], "certificate")
+
+
 RECORDS: dict[int, Grammar] = {
     Kind.PROFILE: rest,
     Kind.ANCHORS: many(record(number, number, signed, raw(28))),
@@ -52,6 +83,8 @@ RECORDS: dict[int, Grammar] = {
     Kind.RETRACTION: counted(number),
     Kind.SIGHTING: record(number, counted(number)),
     Kind.LINK: record(_FRAME, _FRAME, raw(28), number),
+    Kind.CERTIFICATE: _certificate,
+    Kind.REVOCATION: record(raw(8), number),
 }
 _SIZED = {int(kind): sized(grammar) for kind, grammar in RECORDS.items()}
 PAYLOAD = many(record(number, by_kind(_SIZED, sized(rest))))
@@ -128,6 +161,8 @@ def payloads() -> list[Payload]:
         Payload(sightings=seen),
         Payload(links=links),
         Payload("all", anchors, bundle(Random(3), 5, 1), numbers[:1], seen[:1], links[:1]),
+        Payload(certificate=ROBOTS[0].certificate, anchors=anchors[:1], links=links),
+        Payload(revocations=(Revocation(ROBOTS[1].author, 1), Revocation(ROBOTS[2].author, 0))),
     ]
 
 
@@ -184,15 +219,19 @@ def change_bundle(body: bytes, rng: Random) -> bytes:
         return body
 
 
-def change(data: bytes, grammar: Grammar, rng: Random, flip: Flip) -> bytes:
-    """Change the tree, then (mostly) make ids, work, signatures and checksums right again."""
+def change(
+    data: bytes, grammar: Grammar, rng: Random, flip: Flip, config: Config = CONFIG
+) -> bytes:
+    """Change the tree, then (mostly) make ids, certificates, work, signatures and checksums right
+    again, as the fleet of this configuration wants them.
+    """
     root = tree(data, grammar)
     before = {id(node): id_of(node.dump()) for node in labelled(root, "transaction")}
     mutate(root, rng, flip, {"bundle": change_bundle})
     renamed: dict[bytes, bytes] = {}
     for node in labelled(root, "transaction"):
         if rng.random() < 0.95:
-            _seal(node, renamed, rng)
+            _seal(node, renamed, rng, config)
         renamed[before.get(id(node), b"")] = id_of(node.dump())
     for node in labelled(root, "message"):
         if rng.random() < 0.95 and node.items:
@@ -200,8 +239,8 @@ def change(data: bytes, grammar: Grammar, rng: Random, flip: Flip) -> bytes:
     return root.dump()
 
 
-def _seal(node: Branch, renamed: dict[bytes, bytes], rng: Random) -> None:
-    """Point to the transactions before by their new ids; work and sign."""
+def _seal(node: Branch, renamed: dict[bytes, bytes], rng: Random, config: Config) -> None:
+    """Point to the transactions before by their new ids; certify, work and sign."""
     if len(node.items) != 9:
         return
     previous, references, key = node.items[3], node.items[5], node.items[1]
@@ -212,11 +251,21 @@ def _seal(node: Branch, renamed: dict[bytes, bytes], rng: Random) -> None:
         ids = [renamed.get(id_, id_) for id_ in ids]
         ids = sorted(set(ids)) if rng.random() < 0.9 else ids
         references.items = [Leaf("raw", id_) for id_ in ids]
+    if config.closed and rng.random() < 0.9:
+        _certify(node, key.dump(), config)
     unworked = Branch("list", node.items[:7]).dump()
-    unsigned = unworked + transaction._work(CONFIG, unworked)
+    unsigned = unworked + transaction._work(config, unworked)
     robot = _BY_KEY.get(key.dump(), ROBOTS[0])
-    signature = robot.sign(transaction._SIGNED + CONFIG.fleet_id + unsigned)
+    signature = robot.sign(transaction._SIGNED + config.fleet_id + unsigned)
     node.items[7:] = [Leaf("raw", unsigned[-4:]), Leaf("raw", signature)]
+
+
+def _certify(node: Branch, key: bytes, config: Config) -> None:
+    """Let the fleet key vouch for whatever name stands with whatever key."""
+    for certificate in labelled(node, "certificate"):
+        name = certificate.dump()[:-64]
+        signature = AUTHORITY.sign(identity._CERTIFIED + config.fleet_id + key + name)
+        certificate.items = [Leaf("raw", name), Leaf("raw", signature)]
 
 
 def _checksum(node: Branch) -> None:

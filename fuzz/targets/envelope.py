@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from random import Random
 
+from dagmap.config import Config
 from dagmap.payload import Payload
-from dagmap.transaction import MAX_SIZE, id_of, parse, seal
+from dagmap.transaction import MAX_SIZE, glance, id_of, parse, seal
 from dagmap.wire import Refusal
 from grammar import Flip
 from targets import Target
@@ -15,12 +16,18 @@ from targets._wire import CONFIG, ROBOTS, TRANSACTION, change, payloads
 
 def run(data: bytes) -> bool:
     try:
-        found = parse(data, CONFIG)
+        check(data, CONFIG)
     except Refusal:
         return False
-    assert found.data == data and found.id == id_of(data) and len(data) <= MAX_SIZE
-    assert found.decode_again(CONFIG).features == found.features
     return True
+
+
+def check(data: bytes, config: Config) -> None:
+    """Judge a transaction. Raises Refusal."""
+    found = parse(data, config)
+    assert glance(data) == (found.author, found.previous)
+    assert found.data == data and found.id == id_of(data) and len(data) <= MAX_SIZE
+    assert found.decode_again(config).features == found.features
 
 
 def mutate(data: bytes, rng: Random, flip: Flip) -> bytes:

@@ -17,10 +17,12 @@ _MESSAGE = message(rest)
 
 
 def run(data: bytes) -> bool:
+    claimed = messages.kind_of(data), messages.sender_of(data)
     try:
         sender, found = messages.parse(data, CONFIG)
     except Refusal:
         return False
+    assert claimed[0] is not None and claimed[1] == sender
     assert messages.encode(found, CONFIG, sender) == data, "two spellings of one message"
     return True
 

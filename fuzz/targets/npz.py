@@ -143,4 +143,5 @@ def seeds() -> Iterable[bytes]:
 
 
 ENCODERS = ("save_cycles", "_column", "_offsets", "_optional")
-TARGET = Target(run, mutate, seeds, {"dagmap.io.sources.npz": ENCODERS}, max_len=16_384)
+PARSERS = {"dagmap.io.sources.npz": ENCODERS, "dagmap.io.npy": ()}
+TARGET = Target(run, mutate, seeds, PARSERS, max_len=16_384)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from random import Random
 
-from dagmap.payload import decode_payload, encode_payload
+from dagmap.payload import decode_payload, encode_payload, first_certificate
 from dagmap.wire import Refusal
 from grammar import Flip
 from targets import Target
@@ -13,14 +13,24 @@ from targets._wire import CONFIG, PAYLOAD, change, payloads
 
 
 def run(data: bytes) -> bool:
+    first = _first(data)
     try:
         found = decode_payload(data, CONFIG.graph.n_p)
     except Refusal:
         return False
+    assert first in (None, found.certificate), "the certificate that was looked for is another"
+    assert found.robot is None or found.robot.isprintable()
     once = encode_payload(found)
     again = encode_payload(decode_payload(once, CONFIG.graph.n_p))
     assert once == again and len(once) <= len(data), "encoding does not give what was read"
     return True
+
+
+def _first(data: bytes) -> bytes | None:
+    try:
+        return first_certificate(data)
+    except Refusal:
+        return None
 
 
 def mutate(data: bytes, rng: Random, flip: Flip) -> bytes:
@@ -31,7 +41,7 @@ def mutate(data: bytes, rng: Random, flip: Flip) -> bytes:
 
 def seeds() -> Iterable[bytes]:
     unknown = b"\x63\x05later"
-    return [*map(encode_payload, payloads()), unknown]
+    return [*map(encode_payload, payloads()), unknown, b"\x07\x40" + bytes(64)]
 
 
 ENCODERS = ("encode_payload", "_encode_*", "Bundle.cores")

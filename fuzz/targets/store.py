@@ -46,7 +46,9 @@ def run(data: bytes) -> bool:
             Store.open(_FILE)  # what is not there is not made without a fleet
         with Store.open(_FILE, CONFIG.fleet_id, ROBOTS[0].author) as store:
             kept = list(store)
-            assert len(store) == len(kept) and all(isinstance(item, bytes) for item in kept)
+            assert len(store) == len(kept) == len(store.ids()) and all(
+                isinstance(item, bytes) for item in kept
+            )
             store.append(id_of(b"next"), b"next")
         Store.open(_FILE).close()
     except DagmapError as error:

@@ -11,10 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ..model import Floats, RecordingError, Uint8s
+from .npy import BROKEN, read_array, read_layout, read_members
 from .ply import read_vertices
 
-_BROKEN = (zipfile.BadZipFile, OSError, ValueError, EOFError)
+_FITS = np.dtype([("state", "u1")])
 _NAMES = ("positions", "points")  # of an array (N, 3) in an .npz, whichever there is
+_ARRAYS = (*_NAMES, "states", "pose", "offsets")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +46,7 @@ def read_cloud(path: Path) -> Cloud:
 
 
 def _read_ply(path: Path) -> Cloud:
-    vertices = read_vertices(path, ("x", "y", "z"), "give a PLY with x, y and z in metres")
+    vertices = read_vertices(path, ("x", "y", "z"), "give a PLY with x, y and z in metres", _FITS)
     names = vertices.dtype.names or ()
     states = vertices["state"].astype(np.uint8) if "state" in names else None
     return Cloud(np.stack([vertices[n].astype(np.float64) for n in "xyz"], axis=1), states)
@@ -52,10 +54,8 @@ def _read_ply(path: Path) -> Cloud:
 
 def _read_npz(path: Path) -> Cloud:
     try:
-        with open(path, "rb") as file, np.load(file) as archive:
-            wanted = {*_NAMES, "states", "pose", "offsets"}
-            arrays = {name: archive[name] for name in wanted & set(archive.files)}
-    except _BROKEN as error:
+        arrays = _load(path)
+    except BROKEN as error:
         raise RecordingError(f"{path}: damaged or no .npz file ({error}); write it anew") from None
     points = next((arrays[name] for name in _NAMES if name in arrays), None)
     if points is None or points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
@@ -65,16 +65,37 @@ def _read_npz(path: Path) -> Cloud:
     states = arrays.get("states")
     if states is not None and states.shape != (len(points),):
         raise RecordingError(f"{path}: states {states.shape} for {len(points)} points; one each")
+    if states is not None and not ((states >= 0) & (states <= 255)).all():
+        raise RecordingError(f"{path}: states that are none; whole numbers up to 255 are wanted")
     return Cloud(points.astype(np.float64), None if states is None else states.astype(np.uint8))
+
+
+def _load(path: Path) -> dict[str, npt.NDArray[Any]]:
+    """The arrays that a cloud may have."""
+    with zipfile.ZipFile(path) as archive:
+        members = read_members(archive)
+        found = {name: members[name] for name in _ARRAYS if name in members}
+        for name, info in found.items():
+            shape, dtype, holds = read_layout(archive, info, path.stat().st_size)
+            if not holds or dtype.kind not in "fiu":
+                raise ValueError(f"{name} claims {shape} {dtype}")
+        return {name: read_array(archive, info) for name, info in found.items()}
 
 
 def _placed(path: Path, points: npt.NDArray[Any], arrays: dict[str, npt.NDArray[Any]]) -> Floats:
     """The points of a cycle stream in the SLAM's frame."""
     poses, offsets = arrays["pose"], arrays.get("offsets", np.zeros(0, np.int64))
-    if poses.shape != (len(offsets) - 1, 4, 4) or (len(offsets) and offsets[-1] != len(points)):
+    ends = offsets.ndim == 1 and offsets.dtype.kind in "iu" and [0, *offsets, len(points)]
+    if (
+        not ends
+        or ends != sorted(ends)
+        or ends[-2] != ends[-1]
+        or poses.shape != (len(ends) - 3, 4, 4)
+    ):
         raise RecordingError(f"{path}: pose, offsets and points do not belong together")
-    parts = [
-        points[a:b] @ pose[:3, :3].T + pose[:3, 3]
-        for pose, a, b in zip(poses, offsets[:-1], offsets[1:], strict=True)
-    ]
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is found by its values
+        parts = [
+            points[a:b] @ pose[:3, :3].T + pose[:3, 3]
+            for pose, a, b in zip(poses, offsets[:-1], offsets[1:], strict=True)
+        ]
     return np.concatenate([np.zeros((0, 3)), *parts])

@@ -37,6 +37,7 @@ _VERTEX = (
     ("witnesses", "<u2", "ushort"),
 )
 _DTYPE = np.dtype([(name, code) for name, code, _ in _VERTEX])
+_WHOLE = np.dtype([(name, code) for name, code, _ in _VERTEX if "u" in code])
 _HEADER = "\n".join(
     [
         "ply",
@@ -115,7 +116,7 @@ def read_ply(path: Path) -> PlyMap:
     Raises RecordingError naming the file and what is wrong.
     """
     names = [name for name, _, _ in _VERTEX]
-    vertices = read_vertices(path, names, "give a map.ply that DAGmap wrote")
+    vertices = read_vertices(path, names, "give a map.ply that DAGmap wrote", _WHOLE)
     return PlyMap(
         np.stack([vertices[name].astype(np.float64) for name in ("x", "y", "z")], axis=1),
         np.stack([vertices[name].astype(np.uint8) for name in ("red", "green", "blue")], axis=1),

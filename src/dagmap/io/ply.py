@@ -35,14 +35,20 @@ _MAX_LINE = 1000  # bytes of a header line
 _BINARY, _ASCII = b"binary_little_endian", b"ascii"
 
 
-def read_vertices(path: Path, wanted: Sequence[str], remedy: str) -> npt.NDArray[np.void]:
+def read_vertices(
+    path: Path, wanted: Sequence[str], remedy: str, fits: np.dtype[np.void]
+) -> npt.NDArray[np.void]:
     """The vertices as rows of a structured array that has at least the columns `wanted`.
 
+    fits: types whose range the values of these columns keep to, in whatever type they are stored.
     Raises RecordingError naming the file, what is wrong, and the remedy.
     """
     try:
         with open(path, "rb") as file:
-            return _read(file, wanted)
+            rows = _read(file, wanted)
+        for name in set(fits.names or ()) & set(rows.dtype.names or ()):
+            _check_fit(name, rows[name], fits[name])
+        return rows
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}); check the path") from None
     except _Unusable as fault:
@@ -67,18 +73,28 @@ def _read(file: BinaryIO, wanted: Sequence[str]) -> npt.NDArray[np.void]:
 
 def _parse(file: BinaryIO, dtype: np.dtype[np.void], count: int) -> npt.NDArray[Any]:
     lines = [line for _, line in zip(range(count), file, strict=False)]
-    if not lines:
+    if not b"".join(lines).strip():
         return np.zeros(0, dtype)
     try:
-        table = np.loadtxt(io.BytesIO(b"".join(lines)), np.float64, ndmin=2)
+        table = np.loadtxt(io.BytesIO(b"".join(lines)), np.float64, comments=None, ndmin=2)
         if table.shape[1] != len(dtype.names or ()):
             raise ValueError(f"{table.shape[1]} numbers in a line")
     except ValueError as error:
         raise _Unusable(f"a line of its vertices is wrong ({error})") from None
     rows = np.zeros(len(table), dtype)
     for column, name in enumerate(dtype.names or ()):
-        rows[name] = table[:, column]
+        _check_fit(name, table[:, column], dtype[name])
+        with np.errstate(over="ignore"):  # beyond float32: infinite
+            rows[name] = table[:, column]
     return rows
+
+
+def _check_fit(name: str, values: npt.NDArray[Any], kind: np.dtype[Any]) -> None:
+    """Fractions are let through, and lost: programs store whole numbers as floats."""
+    if kind.kind in "iu":
+        low, high = np.iinfo(kind).min, np.iinfo(kind).max
+        if not ((values >= low) & (values <= high)).all():
+            raise _Unusable(f"{name} holds something else than numbers from {low} to {high}")
 
 
 def _read_header(file: BinaryIO, wanted: Sequence[str]) -> tuple[bytes, np.dtype[np.void], int]:

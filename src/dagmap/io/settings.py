@@ -15,6 +15,8 @@ import msgspec
 from ..config import Config, _Checked, load_config
 from ..model import ConfigError
 
+_MAX_FILE_NAME = 255  # bytes, of one part of a path
+
 
 class SourceConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The recording that stands in for a SLAM. Without this table the robot only listens."""
@@ -116,8 +118,15 @@ class Settings:
     folder: Path
 
     def at(self, path: str) -> Path:
-        """A path of the file as one that can be opened."""
-        return Path(os.path.normpath(self.folder / Path(path).expanduser()))
+        """A path of the file as one that can be opened. Raises ConfigError where none can be."""
+        try:
+            found = Path(os.path.normpath(self.folder / Path(path).expanduser()))
+        except RuntimeError as error:
+            raise ConfigError(f"path {path[:60]!r}: {error}; write the folder out") from None
+        names = [os.fsencode(name) for name in found.parts]
+        if b"\0" in b"".join(names) or max(map(len, names), default=0) > _MAX_FILE_NAME:
+            raise ConfigError(f"path {path[:60]!r}: no file can have this name; choose another")
+        return found
 
     @property
     def ledger(self) -> Path:

@@ -20,6 +20,8 @@ from .robot import Clock
 from .sensor import SensorConfig
 from .walk import MotionConfig
 
+MAX_CHAOS = 10_000  # faults of a kind that a seed draws
+
 
 class _Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def _require(self, holds: bool, name: str, wanted: str) -> None:
@@ -50,10 +52,10 @@ class Chaos(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         for name in ("crashes", "partitions"):
-            self._require(getattr(self, name) >= 0, name, "at least 0")
+            self._require(0 <= getattr(self, name) <= MAX_CHAOS, name, f"0 to {MAX_CHAOS}")
         for name in ("down", "apart"):
             low, high = getattr(self, name)
-            self._require(0 <= low <= high, name, "two times, the shorter first,")
+            self._require(0 <= low <= high < math.inf, name, "two times, the shorter first,")
 
 
 class Liars(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):

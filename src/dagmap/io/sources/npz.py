@@ -9,19 +9,17 @@ and `moved_offsets (C + 1,)` *; `session (C,)` *; `version`, 1 where it is left 
 
 from __future__ import annotations
 
-import math
-import re
 import zipfile
-import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import IO, Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from ...model import Cycle, CycleError, Int64s, RecordingError, quantise_cycle
 from ..export import atomic_write
+from ..npy import BROKEN, read_array, read_header, read_layout, read_members
 from ._source import Options, checked
 
 UNDERSTANDS = "a cycle stream (.npz)"
@@ -49,12 +47,6 @@ _LAYOUT: dict[str, tuple[str, tuple[str | int, ...]]] = {
 _NEEDED = ("stamp", "pose", "points", "offsets")
 _TOGETHER = (("removed", "removed_offsets"), ("moved_stamp", "moved_pose", "moved_offsets"))
 _OFFSETS = {"offsets": "points", "removed_offsets": "removed", "moved_offsets": "moved_stamp"}
-_DEFLATE = 1100  # deflate makes nothing smaller than by this factor
-_HEADER_MOST = 10_000  # bytes
-_FIELD = r"'(\w+)':('[^']*'|True|False|\([\d,]*\))"
-_FIELDS = re.compile(rf"\{{{_FIELD}(?:,{_FIELD})*,?\}}")
-_TYPE = re.compile(r"'([<>|=]?[biufcSUO]\d*)'")
-_BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, RuntimeError, MemoryError)
 
 
 def matches(path: Path) -> bool:
@@ -74,7 +66,7 @@ class CycleStream:
         self.name, self._path = path.stem, path
         try:
             self._arrays = _load(path)
-        except _BROKEN as error:  # RecordingError is none of these
+        except BROKEN as error:  # RecordingError is none of these
             raise RecordingError(
                 f"{path}: truncated, damaged or no .npz file ({error}); copy or write it anew"
             ) from None
@@ -115,27 +107,20 @@ def _part(arrays: _Arrays, name: str, i: int) -> slice:
 def _load(path: Path) -> _Arrays:
     """The arrays. What they claim to be is checked before any memory is taken for them."""
     with zipfile.ZipFile(path) as archive:
-        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-        for name, info in members.items():
-            if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise ValueError(f"{name[:60]!r} is packed by method {info.compress_type}")
+        members = read_members(archive)
         _check_version(path, archive, members)
         _check_names(path, set(members))
         shapes: dict[str, tuple[int, ...]] = {}
         sizes: dict[str, int] = {}
         for name in sorted(members, key=list(_LAYOUT).index):
-            info = members[name]
-            with archive.open(info) as file:
-                shapes[name], dtype, _ = _header(file)
-                claimed = file.tell() + math.prod(shapes[name]) * dtype.itemsize
+            shapes[name], dtype, holds = read_layout(archive, members[name], path.stat().st_size)
             _check_shape(path, name, shapes[name], dtype, sizes)
-            packed = min(info.compress_size, path.stat().st_size)
-            if claimed != info.file_size or claimed > _DEFLATE * (packed + 64):
+            if not holds:
                 raise RecordingError(
                     f"{path}: {name} claims {shapes[name]} {dtype}, which is not what the file "
                     "holds; write it anew"
                 )
-        return {name: _array(archive, info) for name, info in members.items()}
+        return {name: read_array(archive, info) for name, info in members.items()}
 
 
 def _check_version(
@@ -145,46 +130,15 @@ def _check_version(
     if "version" not in members:
         return
     with archive.open(members["version"]) as file:
-        shape, dtype, _ = _header(file)
+        shape, dtype, _ = read_header(file)
     if shape != () or dtype.kind not in "iu":
         raise RecordingError(f"{path}: version is {shape} {dtype}; one whole number is wanted")
-    version = int(_array(archive, members["version"]))
+    version = int(read_array(archive, members["version"]))
     if version != VERSION:
         raise RecordingError(
             f"{path}: version {version} of the cycle stream; this DAGmap reads {VERSION}, "
             "install a newer one or write the file anew"
         )
-
-
-def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any], Literal["C", "F"]]:
-    """Shape, type and order. NumPy's own reader evaluates Python, and raises whatever that does."""
-    size = {(1, 0): 2, (2, 0): 4}.get(np.lib.format.read_magic(file))
-    length = _HEADER_MOST + 1 if size is None else int.from_bytes(file.read(size), "little")
-    if length > _HEADER_MOST:
-        raise ValueError("an array of another npy version")
-    text = "".join(file.read(length).decode("latin-1").split())
-    fields = dict(re.findall(_FIELD, text)) if _FIELDS.fullmatch(text) else {}
-    kind = _TYPE.fullmatch(fields.get("descr", ""))
-    shape, fortran = fields.get("shape", ""), fields.get("fortran_order")
-    if kind is None or not shape.startswith("(") or fortran not in ("True", "False"):
-        raise ValueError(f"{text[:80]!r} is no header of an array of numbers")
-    try:
-        dtype = np.dtype(kind[1])
-    except TypeError:
-        raise ValueError(f"an array of type {kind[1]}") from None
-    lengths = tuple(int(n) for n in shape.strip("()").split(",") if n)
-    return lengths, dtype, "F" if fortran == "True" else "C"
-
-
-def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> _Array:
-    with archive.open(info) as file:
-        shape, dtype, order = _header(file)
-        size = math.prod(shape) * dtype.itemsize
-        data = bytearray(file.read(size))
-        file.read(1)  # at the end the checksum is compared
-    if len(data) < size:
-        raise ValueError(f"{info.filename[:60]!r} ends early")
-    return np.ndarray(shape, dtype, data, order=order)
 
 
 def _check_names(path: Path, names: set[str]) -> None:
