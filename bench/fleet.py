@@ -59,9 +59,7 @@ def steady(folder: Path, seconds: float = 30.0) -> list[Row]:
         before, at = [robot.cpu() for robot in robots], time.monotonic()
         time.sleep(seconds - WARM - 2.0)
         passed = time.monotonic() - at
-        shares = [
-            (robot.cpu() - spent) / passed for robot, spent in zip(robots, before, strict=True)
-        ]
+        spent = [robot.cpu() - first for robot, first in zip(robots, before, strict=True)]
         settle(robots, int(seconds * HERTZ))
         memory = max(robot.peak() for robot in robots)
     took = observe_ms(robots[0])
