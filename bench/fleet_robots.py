@@ -75,7 +75,10 @@ class Robot:
         self.began = time.monotonic_ns()
         with self.log.open("wb") as log:
             self.process = subprocess.Popen(
-                [*command, "--log", "debug", *options], stderr=log, stdout=subprocess.DEVNULL
+                [*command, "--log", "debug", *options],
+                stderr=log,
+                stdout=subprocess.DEVNULL,
+                env={**os.environ, "PYTHONDONTWRITEBYTECODE": ""},  # compiled once, as for a user
             )
         return self
 

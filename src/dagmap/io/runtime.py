@@ -32,7 +32,7 @@ from ..model import (
 from .log import Log
 from .queues import Inbox, Question
 
-TICK = 0.05  # s between the ticks of an agent
+TICK = 0.05  # s between the ticks of an agent, where nothing comes in
 _STATE_PERIOD = 5.0  # s between two lines of the log that say how it stands
 _LOOK_PERIOD = 1.0  # s between two looks for transactions that a person brings
 
@@ -101,6 +101,7 @@ class Runtime:
         self.started = time.monotonic()
         self._brought = brought
         self._next_tick = self._next_state = self._next_look = self.started
+        self._tick_took = 0.0
         self._unfolded: list[TransactionId] = []  # for `_trace` only
         self._last_news = 0.0  # on the agent's clock
         self._stopping = False
@@ -142,9 +143,13 @@ class Runtime:
         if time.monotonic() >= self._next_look:
             events += [event for data in self._brought() for event in self.agent.take(data)]
             self._next_look = time.monotonic() + _LOOK_PERIOD
-        if time.monotonic() >= self._next_tick:
+        if (before := time.monotonic()) >= self._next_tick:
             events += self.agent.tick(self.now)
-            self._next_tick = time.monotonic() + TICK
+            after = time.monotonic()
+            self._tick_took, self._next_tick = after - before, after + TICK
+        elif any(isinstance(event, Accepted) for event in events):
+            # Fold it soon, but together with what comes meanwhile: half of the time is for that.
+            self._next_tick = min(self._next_tick, before + self._tick_took)
         self._keep(events)
         self._trace(begun, events)
         out = self.agent.outbox()
