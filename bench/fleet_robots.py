@@ -161,9 +161,13 @@ class Link:
         while True:
             try:
                 here, _ = self._listener.accept()
-                there = socket.create_connection(("127.0.0.1", self._target), 5)
             except OSError:
                 return
+            try:
+                there = socket.create_connection(("127.0.0.1", self._target), 5)
+            except OSError:  # not there yet: the other one tries again
+                here.close()
+                continue
             for pair in ((here, there), (there, here)):
                 threading.Thread(target=self._pump, args=pair, daemon=True).start()
 
