@@ -6,7 +6,8 @@
 #   make test         make check, then the test suite
 #   make check        ruff, mypy, import-linter
 #   make bench        measure the speed (dagmap bench)
-#   make sweep        thousands of simulated missions with faults and liars; SEEDS=2000 for more
+#   make sweep        thousands of simulated missions with faults and liars, SEEDS=2000 for more, and
+#                     a real robot killed 200 times, KILLS=2000 for more
 #   make reliability  all figures and plots of docs/reliability.md; hours
 #   make fuzz         fuzz all that reads foreign bytes, 10^6 executions (RUNS=...); Linux, Python 3.11 on
 #   make lock         renew requirements/*.txt after a change of dependencies in pyproject.toml
@@ -30,6 +31,7 @@ TWINS := tests/test_graph.py tests/test_fold.py tests/test_codec.py tests/test_f
 # The long scenarios are runs of their own; a sweep takes the short ones, with so many seeds each.
 SWEPT = $(filter-out scenarios/hour.toml scenarios/hundred.toml,$(wildcard scenarios/*.toml))
 SEEDS ?= 500
+KILLS ?= 200
 OFFICE := examples/office/robot1 examples/office/robot2 examples/office/robot3
 
 # A sourced ROS workspace sets PYTHONPATH; its packages must not mix with those of the environments.
@@ -61,6 +63,7 @@ bench: $(TEST)/.package
 
 sweep: $(TEST)/.package
 	@$(TEST)/bin/dagmap simulate $(SWEPT) --seeds $(SEEDS)
+	DAGMAP_KILLS=$(KILLS) $(TEST)/bin/python -m pytest -q tests/test_fleet_crash.py::TestKill
 
 reliability: $(TEST)/.package
 	@$(TEST)/bin/python bench/reliability.py

@@ -5,11 +5,16 @@ from __future__ import annotations
 import threading
 
 import numpy as np
+import pytest
 
-from dagmap import Config, Cycle
-from dagmap.io.queues import Inbox, Question, SendQueue
-from dagmap.messages import Heads, Transactions, encode
+import dagmap.agent
+from dagmap import Accepted, Config, Cycle
+from dagmap.agent import Parsers
+from dagmap.io.queues import Inbox, Question, Rates, SendQueue, Throttle
+from dagmap.messages import Heads, Transactions, Want, encode
 from dagmap.model import Outgoing
+from scene import agent as scene_agent
+from scene import cycles
 
 ME, YOU = b"me......", b"you....."
 
@@ -114,3 +119,69 @@ class TestSendQueue:
         sender.start()
         assert queue.take() == out
         sender.join()
+
+
+class TestRates:
+    def make(self, **rates: float) -> tuple[Inbox, list[float]]:
+        now = [100.0]
+        return Inbox(1 << 30, 1 << 30, Rates(**rates), lambda: now[0]), now  # type: ignore[arg-type]
+
+    def put(self, inbox: Inbox, count: int, size: int = 100, sender: bytes = ME) -> int:
+        return sum(inbox.put_message(message(size, sender)) for _ in range(count))
+
+    def test_messages_of_one_sender(self) -> None:
+        inbox, now = self.make(messages_of_one=10)
+        assert self.put(inbox, 50) == 10 and self.put(inbox, 50, sender=YOU) == 10
+        assert inbox.dropped == 80
+        now[0] += 0.5
+        assert self.put(inbox, 50) == 5
+        now[0] += 1000.0  # silence is not saved up beyond a second
+        assert self.put(inbox, 50) == 10
+
+    def test_bytes_of_one_sender(self) -> None:
+        inbox, now = self.make(bytes_of_one=10_000)
+        assert self.put(inbox, 50, 1_000) == 10
+        now[0] += 0.25
+        assert self.put(inbox, 50, 1_000) == 2
+        assert self.put(inbox, 50, 1_000, YOU) == 10
+
+    def test_changing_ones_name_does_not_help(self) -> None:
+        inbox, now = self.make(messages=20, messages_of_one=10)
+        names = [i.to_bytes(8, "big") for i in range(1000)]
+        assert sum(self.put(inbox, 1, sender=name) for name in names) == 20
+        assert len(inbox._throttle._of_one) == Throttle.SENDERS
+        now[0] += 1.0
+        assert self.put(inbox, 50) == 10  # the honest robot's share is there again
+
+    def test_what_is_refused_costs_an_honest_robot_nothing(self) -> None:
+        inbox, _ = self.make(messages=20, messages_of_one=10)
+        assert self.put(inbox, 1000, sender=YOU) == 10
+        assert self.put(inbox, 50) == 10
+
+    def test_a_question_counts_for_its_answer(self) -> None:
+        inbox, now = self.make(bytes_of_one=10_000, question=4_000)
+        want = encode(Want(((ME, 0, 1 << 30),)), Config(), ME)
+        assert sum(inbox.put_message(want) for _ in range(50)) == 2
+        now[0] += 1.0
+        assert self.put(inbox, 50, 1_000) == 10
+
+
+def test_a_replay_costs_one_look_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is held already is known by its hash: nothing of it is read, let alone verified."""
+    speaker, listener = scene_agent("speaker"), scene_agent("listener")
+    for each in cycles(1):
+        speaker.observe(each, each.stamp)
+    said = [out.data for out in speaker.outbox()]
+    first = [event for data in said for event in listener.receive(data, 0.0)]
+    assert sum(isinstance(event, Accepted) for event in first) == len(speaker.ledger) > 3
+    hashed: list[bytes] = []
+    real = dagmap.agent.id_of
+    monkeypatch.setattr(dagmap.agent, "id_of", lambda data: hashed.append(data) or real(data))
+    for name in ("add", "worth_judging"):
+        monkeypatch.setattr(listener.ledger, name, None)
+    listener._parsers = Parsers(transaction=None)  # type: ignore[arg-type]  # not to be called
+    before = listener.digest()
+    for _ in range(10):
+        assert not [event for data in said for event in listener.receive(data, 1.0)]
+    assert len(hashed) == 10 * len(speaker.ledger)
+    assert listener.digest() == before and not listener.outbox()

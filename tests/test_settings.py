@@ -54,6 +54,20 @@ class TestFile:
             for key in table.__struct_fields__:
                 assert re.search(rf"^(\[network\.)?{key}\b", block[1], re.M), key
 
+    def test_the_documented_limits(self, tmp_path: Path) -> None:
+        """The table of limits in docs/fleet.md names every bound, and its default."""
+        text = (EXAMPLES.parents[1] / "docs" / "fleet.md").read_text()
+        limits = text.partition("## Limits")[2].partition("\n## ")[0]
+        rows = dict(re.findall(r"^\| `([a-z_.]+)` \| (\d+) \| .{20,} \|$", limits, re.M))
+        config = load(tmp_path, STORE).config
+        for name, value in rows.items():
+            table, _, key = name.partition(".")
+            assert int(value) == getattr(getattr(config, table), key), name
+        bounds = [f"ledger.{key}" for key in config.ledger.__struct_fields__]
+        network = config.network.__struct_fields__
+        bounds += [f"network.{key}" for key in network if "bytes" in key or "messages" in key]
+        assert set(bounds) <= rows.keys() and len(bounds) == 9
+
 
 class TestMistakes:
     @pytest.mark.parametrize(
@@ -70,6 +84,14 @@ class TestMistakes:
                 "NetworkConfig: mode = 'client', but a client wants a router",
             ),
             (STORE + "[network]\nsend_bytes = 1", "send_bytes = 1, but 65536 to"),
+            (
+                STORE + "[network]\nreceive_messages_per_second = 1",
+                "receive_messages_per_second = 1, but 10 to",
+            ),
+            (
+                STORE + "[network]\nreceive_bytes_per_second_per_robot = 70000",
+                "receive_bytes_per_second_per_robot = 70000, but a question counts",
+            ),
             (
                 STORE + '[network]\nconnect = ["tcp/x:1"]\n'
                 '[network.tls]\nca = "a"\ncertificate = "b"\nkey = "c"',

@@ -155,7 +155,13 @@ class Agent:
     @property
     def holds_back(self) -> bool:
         """Whether something that is valid still waits to be issued (the next ticks do it)."""
-        return self.observing.waiting
+        return self.observing.waiting and not self._silenced
+
+    @property
+    def _silenced(self) -> bool:
+        """Whether the key was used twice, or revoked: what it signs counts no more."""
+        own = self.ledger.chain(self.identity.author)
+        return own.cut is not None or own.revoked is not None
 
     @property
     def map(self) -> WorldMap:
@@ -218,9 +224,8 @@ class Agent:
         """Section 4.2: seal what is valid and may go out, and take it through the door."""
         events: list[Event] = []
         me = self.identity.author
-        own = self.ledger.chain(me)
-        if own.cut is not None or own.revoked is not None:
-            return events  # the key was used twice, or revoked: what it signs counts no more
+        if self._silenced:
+            return events
         for payload in self.observing.payloads(now, self.ledger.features(me)):
             main = self.ledger.chain(me).main
             previous = main[-1].id if main else None

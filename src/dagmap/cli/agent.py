@@ -21,9 +21,10 @@ from ..io.data_folder import next_session, open_folder, restore
 from ..io.log import Level, Log
 from ..io.metrics import MetricsServer
 from ..io.player import Player
-from ..io.queues import Inbox
+from ..io.queues import Inbox, Rates
+from ..io.revocations import Revocations
 from ..io.runtime import Runtime
-from ..io.settings import Settings, load_settings
+from ..io.settings import AgentConfig, Settings, load_settings
 from ..io.sources import Source, open_source
 from ..io.status import StatusServer, report
 from ..io.transport import Transport, load_zenoh
@@ -84,13 +85,14 @@ class AgentCommand:
         stack.enter_context(store)
         agent = restore(settings, identity, store, self._track)
         session = next_session(agent)
-        inbox = Inbox(config.network.receive_bytes, config.network.receive_bytes_per_robot)
+        inbox = _inbox(config)
         transport = stack.enter_context(
             Transport(config.network, settings.folder, config.fleet_id, identity.author, inbox)
         )
         checkpoint = CheckpointFile(store, log)
         answer = partial(_report, transport)
-        runtime = Runtime(agent, store, transport, inbox, log, answer, checkpoint.keep)
+        brought = Revocations(settings.keys / "revocations").new if config.closed else list
+        runtime = Runtime(agent, store, transport, inbox, log, answer, checkpoint.keep, brought)
         stack.callback(checkpoint.write, agent)  # closes before the store does
         stack.enter_context(StatusServer(settings.control, inbox))
         if (address := config.metrics.address) is not None:
@@ -111,6 +113,18 @@ class AgentCommand:
             transient=True,
             disable=not (total and self.console.is_terminal),
         )
+
+
+def _inbox(config: AgentConfig) -> Inbox:
+    """What comes in, within the configuration's limits."""
+    network = config.network
+    rates = Rates(
+        network.receive_messages_per_second,
+        network.receive_messages_per_second_per_robot,
+        network.receive_bytes_per_second_per_robot,
+        config.sync.chunk_bytes,
+    )
+    return Inbox(network.receive_bytes, network.receive_bytes_per_robot, rates)
 
 
 def _report(transport: Transport, runtime: Runtime) -> dict[str, object]:

@@ -5,7 +5,7 @@
     fleet.toml    fleet, fleet_key, ...         robot.toml   its name, and all of fleet.toml
     ca.pem        X.509 authority for TLS       certificate  hexadecimal, see identity.py
     robots/       NAME.json, who is enrolled    tls.pem, ca.pem
-    revocations/  0000.tx, 0001.tx, ...
+    revocations/  0000.tx, 0001.tx, ...         revocations/  copies; see revocations.py
 
 Private keys are PEM (PKCS8), made with mode 0600 from the start, and not read where others can read
 them. A folder appears whole or not at all. The fleet's folder belongs in one place: revocations are
@@ -114,6 +114,7 @@ class Fleet:
             _write_new(folder / "robot.toml", lines)
             _write_new(folder / "tls.pem", self._leaf(public_key, name, addresses, days))
             _write_new(folder / "ca.pem", _read(self.folder / "ca.pem"))
+            (folder / "revocations").mkdir()
             _write_new(entry, json.dumps({"public_key": public_key.hex()}).encode() + b"\n")
         return Enrolled(name, author_of(public_key), public_key)
 

@@ -24,9 +24,13 @@ class Log:
         self._lock = threading.Lock()
         self._last: OrderedDict[str, tuple[float, int]] = OrderedDict()  # (when, unsaid since)
 
+    def shows(self, level: Level) -> bool:
+        """Whether lines of this level are written."""
+        return _ORDER[level] >= self._least
+
     def write(self, level: Level, event: str, **fields: object) -> None:
         """One line. Values are made text; what is not plain is quoted as JSON does it."""
-        if _ORDER[level] < self._least:
+        if not self.shows(level):
             return
         stamp = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
         head: dict[str, object] = {"time": stamp, "level": level, "event": event}

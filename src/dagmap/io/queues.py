@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import threading
-from collections import Counter, deque
-from collections.abc import Iterable
+import time
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 from ..messages import Kind, kind_of, sender_of
@@ -28,17 +30,84 @@ class Question:
     answer: dict[str, object] | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Rates:
+    """What may come in within a second; as much again may come at once, after silence."""
+
+    messages: float = math.inf  # from all senders
+    messages_of_one: float = math.inf
+    bytes_of_one: float = math.inf
+    question: int = 0  # bytes that a question counts for: those of the answer that it may cause
+
+
+@dataclass(slots=True)
+class _Bucket:
+    """What one sender may still send now: messages and bytes, filled up as time goes by."""
+
+    messages: float
+    bytes: float
+    filled: float  # s, when
+
+    def fill(self, messages: float, size: float, now: float) -> None:
+        """By the rates of a second, and up to them."""
+        passed, self.filled = now - self.filled, now
+        self.messages = min(messages, self.messages + passed * messages)
+        self.bytes = min(size, self.bytes + passed * size)
+
+
+class Throttle:
+    """Says who sends too much. Use it from one thread at a time.
+
+    The sender is as the message names it: a hint. So the rate of all is what holds against liars;
+    those of one keep an honest robot that has gone wrong from crowding out the others.
+    """
+
+    SENDERS = 256  # that are remembered; whoever is forgotten begins anew
+
+    def __init__(self, rates: Rates, clock: Callable[[], float]) -> None:
+        self._rates, self._clock = rates, clock
+        self._all = _Bucket(rates.messages, math.inf, clock())
+        self._of_one: OrderedDict[AuthorId, _Bucket] = OrderedDict()
+
+    def lets(self, sender: AuthorId, data: bytes) -> bool:
+        """Whether this message may come in; counts it where it may."""
+        rates, now = self._rates, self._clock()
+        size = len(data) + (rates.question if kind_of(data) is Kind.WANT else 0)
+        one = self._of_one.setdefault(
+            sender, _Bucket(rates.messages_of_one, rates.bytes_of_one, now)
+        )
+        self._of_one.move_to_end(sender)
+        if len(self._of_one) > self.SENDERS:
+            self._of_one.popitem(last=False)
+        self._all.fill(rates.messages, math.inf, now)
+        one.fill(rates.messages_of_one, rates.bytes_of_one, now)
+        if self._all.messages < 1 or one.messages < 1 or one.bytes < size:
+            return False
+        self._all.messages -= 1
+        one.messages -= 1
+        one.bytes -= size
+        return True
+
+
 class Inbox:
     """What comes in for the agent: messages, cycles, questions. Any thread puts, one takes.
 
     most, most_of_one: bytes of messages that wait, in all and of one sender (as the message names
         it: a hint, so the first bound is what holds against liars). What exceeds them is dropped.
+    rates: how fast messages may come; what comes faster is dropped, too.
     """
 
     MESSAGES = 16  # taken at once, so that a cycle never waits behind many
 
-    def __init__(self, most: int, most_of_one: int) -> None:
+    def __init__(
+        self,
+        most: int,
+        most_of_one: int,
+        rates: Rates | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._most, self._most_of_one = most, most_of_one
+        self._throttle = Throttle(rates or Rates(), clock)
         self._change = threading.Condition()
         self._work = Work()
         self._messages: deque[bytes] = deque()
@@ -52,7 +121,8 @@ class Inbox:
         sender = sender_of(data)
         with self._change:
             full = self._size + len(data) > self._most
-            if full or self._size_of[sender] + len(data) > self._most_of_one:
+            full = full or self._size_of[sender] + len(data) > self._most_of_one
+            if full or not self._throttle.lets(sender, data):
                 self.dropped += 1
                 return False
             self._size += len(data)

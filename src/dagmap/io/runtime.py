@@ -32,8 +32,9 @@ from ..model import (
 from .log import Log
 from .queues import Inbox, Question
 
-TICK = 0.05  # s between the ticks of an agent
+TICK = 0.05  # s between the ticks of an agent, where nothing comes in
 _STATE_PERIOD = 5.0  # s between two lines of the log that say how it stands
+_LOOK_PERIOD = 1.0  # s between two looks for transactions that a person brings
 
 
 class Ledger(Protocol):
@@ -87,16 +88,21 @@ class Runtime:
         log: Log,
         report: Callable[[Runtime], dict[str, object]],
         keep: Callable[[Agent], None] = lambda agent: None,
+        brought: Callable[[], Iterable[bytes]] = lambda: (),
     ) -> None:
         """report: the answer to a question that somebody puts into the inbox.
 
         keep: called now and then, to keep what makes the next start faster.
+        brought: transactions that came another way than over the network, since the last call.
         """
         self.agent, self.network, self.inbox = agent, network, inbox
         self._store, self._log, self._report, self._keep_state = store, log, report, keep
         self.counts = Counts()
         self.started = time.monotonic()
-        self._next_tick = self._next_state = self.started
+        self._brought = brought
+        self._next_tick = self._next_state = self._next_look = self.started
+        self._tick_took = 0.0
+        self._unfolded: list[TransactionId] = []  # for `_trace` only
         self._last_news = 0.0  # on the agent's clock
         self._stopping = False
 
@@ -130,13 +136,22 @@ class Runtime:
 
     def _step(self) -> None:
         work = self.inbox.take(self._next_tick - time.monotonic())
+        begun = time.monotonic_ns()
         events = [event for cycle in work.cycles for event in self._observe(cycle)]
         for data in work.messages:
             events += self.agent.receive(data, self.now)
-        if time.monotonic() >= self._next_tick:
+        if time.monotonic() >= self._next_look:
+            events += [event for data in self._brought() for event in self.agent.take(data)]
+            self._next_look = time.monotonic() + _LOOK_PERIOD
+        if (before := time.monotonic()) >= self._next_tick:
             events += self.agent.tick(self.now)
-            self._next_tick = time.monotonic() + TICK
+            after = time.monotonic()
+            self._tick_took, self._next_tick = after - before, after + TICK
+        elif any(isinstance(event, Accepted) for event in events):
+            # Fold it soon, but together with what comes meanwhile: half of the time is for that.
+            self._next_tick = min(self._next_tick, before + self._tick_took)
         self._keep(events)
+        self._trace(begun, events)
         out = self.agent.outbox()
         self.network.send(out)
         if any(_is_news(data) for data in (*work.messages, *(each.data for each in out))):
@@ -157,6 +172,7 @@ class Runtime:
         self.counts.points += self.agent.observing.observed - before
         self.counts.observe_s += took
         self.counts.observe_max_s = max(self.counts.observe_max_s, took)
+        self._log.write("debug", "observed", stamp=float(cycle.stamp), ms=1000 * took)
         return events
 
     def _keep(self, events: list[Event]) -> None:
@@ -165,6 +181,26 @@ class Runtime:
         if accepted:
             self._store.append_many(accepted)
             self.counts.stored += len(accepted)
+
+    def _trace(self, begun: int, events: list[Event]) -> None:
+        """For measurements: what was sealed and what is folded by now, on the machine's clock."""
+        if not self._log.shows("debug"):
+            return
+        self._unfolded += [event.id for event in events if isinstance(event, Accepted)]
+        sealed = [event.id for event in events if isinstance(event, Issued)]
+        folded = [] if self.agent.consensus.pending else self._unfolded
+        if sealed or folded:
+            self._log.write(
+                "debug",
+                "step",
+                begun_ns=begun,
+                ended_ns=time.monotonic_ns(),
+                sealed=",".join(id_.hex()[:16] for id_ in sealed),
+                folded=",".join(id_.hex()[:16] for id_ in folded),
+                transactions=len(self.agent.ledger),
+            )
+        if folded:
+            self._unfolded = []
 
     def _note(self, events: list[Event]) -> None:
         """Count, and say what a person should know."""

@@ -46,10 +46,20 @@ class NetworkConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
     send_bytes: int = 16 << 20  # waiting to be sent: a link that stalls for long costs no more
     receive_bytes: int = 32 << 20  # received and not looked at yet, from all robots
     receive_bytes_per_robot: int = 8 << 20  # of that, from one: none crowds out the others
+    # To refuse a message costs 60 us: so a flood of junk costs a quarter of a core, no more.
+    receive_messages_per_second: int = 4000
+    # From one robot. At ten cycles a second it has ten to tell, and one announcement.
+    receive_messages_per_second_per_robot: int = 1000
+    # From one robot, more than can be verified and folded (6 MB). A question counts for
+    # `sync.chunk_bytes`: nobody makes a robot answer faster than that by asking and asking.
+    receive_bytes_per_second_per_robot: int = 16 << 20
 
     def __post_init__(self) -> None:
         for name in ("send_bytes", "receive_bytes", "receive_bytes_per_robot"):
             self._require_range(name, 1 << 16, 1 << 32)
+        self._require_range("receive_messages_per_second", 10, 1 << 32)
+        self._require_range("receive_messages_per_second_per_robot", 10, 1 << 32)
+        self._require_range("receive_bytes_per_second_per_robot", 1 << 16, 1 << 40)
         self._require(
             self.mode != "client" or bool(self.connect) or self.scouting,
             "mode",
@@ -108,6 +118,16 @@ class AgentConfig(Config, frozen=True, kw_only=True, forbid_unknown_fields=True)
     network: NetworkConfig = NetworkConfig()
     metrics: MetricsConfig = MetricsConfig()
     control: ControlConfig = ControlConfig()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        rate = self.network.receive_bytes_per_second_per_robot
+        least = self.sync.chunk_bytes + (1 << 16)
+        if rate < least:  # no question would ever come through
+            raise ConfigError(
+                f"NetworkConfig: receive_bytes_per_second_per_robot = {rate}, but a question "
+                f"counts for an answer: at least sync.chunk_bytes + 65536 = {least} is wanted"
+            )
 
 
 @dataclass(frozen=True, slots=True)
