@@ -140,7 +140,7 @@ class TestAgreement:
         with running(a, b):
             b.start()
             until(b.status, "b")
-            a.start("--speed", 30, "--wait-for", 1)
+            a.start("--speed", 10, "--wait-for", 1)  # slow enough to be seen beginning
             until(lambda: a.status().get("cycles", 0) >= 2, "a to begin")
             proxy.flowing.clear()
             stalled = until(lambda: a.status()["cycles"] == 60 and a.status(), "a to end")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import threading
+import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -129,6 +130,30 @@ class TestRuntime:
         runtime.inbox.put_question(question)
         runtime.run(until_agreed=0.0)
         assert question.answered.is_set() and question.answer == {"x": 1}
+
+    def test_news_is_folded_soon_and_not_only_when_a_tick_is_due(self) -> None:
+        runtime, _, _, _ = make()
+        speaker = scene_agent("b")
+        for cycle in cycles(1):
+            speaker.observe(cycle, cycle.stamp)
+        runtime._step()
+        runtime._next_tick = time.monotonic() + 1000.0
+        for out in speaker.outbox():
+            runtime.inbox.put_message(out.data)
+        runtime._step()
+        assert runtime.agent.consensus.pending
+        runtime._step()  # waits for the tick, not for a thousand seconds
+        assert not runtime.agent.consensus.pending
+        assert runtime.agent.digest() == speaker.digest()
+
+    def test_what_a_person_brings_goes_through_the_door(self) -> None:
+        runtime, disk, _, _ = make()
+        speaker = scene_agent("b")
+        speaker.observe(next(iter(cycles(1))), 0.0)
+        brought = [tx.data for tx in speaker.ledger]
+        runtime._brought = lambda: brought
+        runtime._step()
+        assert set(disk.stored) == {tx.id for tx in speaker.ledger} != set()
 
     def test_it_stops_when_told(self) -> None:
         runtime, _, _, _ = make()

@@ -33,6 +33,7 @@ from .log import Log
 from .queues import Inbox, Question
 
 TICK = 0.05  # s between the ticks of an agent, where nothing comes in
+_SOON = 0.02  # s from what came in to the tick that folds it, together with what comes meanwhile
 _STATE_PERIOD = 5.0  # s between two lines of the log that say how it stands
 _LOOK_PERIOD = 1.0  # s between two looks for transactions that a person brings
 
@@ -148,8 +149,8 @@ class Runtime:
             after = time.monotonic()
             self._tick_took, self._next_tick = after - before, after + TICK
         elif any(isinstance(event, Accepted) for event in events):
-            # Fold it soon, but together with what comes meanwhile: half of the time is for that.
-            self._next_tick = min(self._next_tick, before + self._tick_took)
+            soon = max(_SOON, self._tick_took)  # folding takes half of the time at most
+            self._next_tick = min(self._next_tick, before + soon)
         self._keep(events)
         self._trace(begun, events)
         out = self.agent.outbox()
