@@ -1,5 +1,5 @@
 """The figures of docs/reliability.md: `make reliability` (hours), or for a look at them
-`python bench/reliability.py --seeds 60 --runs 2 --seconds 30 --out /tmp/figures` (minutes).
+`python bench/reliability.py --seeds 60 --runs 2 --seconds 30 --out out/figures` (minutes).
 
 Not part of `dagmap bench`: it measures the promises, not the machine.
 """
