@@ -9,11 +9,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from dagmap import graph, ledger, transaction
+from dagmap import fold, graph, ledger, transaction
 from dagmap.consensus import Consensus
 from dagmap.contribution import Author
 from dagmap.kernels import lattice
 from dagmap.ledger import Ledger
+from dagmap.model import Int32s
 from dagmap.sim.scenario import Scenario, load_scenario
 from dagmap.sim.sweep import Failure, attempt, minimised, sweep, timeline_of
 
@@ -83,12 +84,23 @@ def unchecked_signature(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(transaction, "signature_holds", lambda key, signature, message: True)
 
 
+def one_witness_too_many(patch: pytest.MonkeyPatch) -> None:
+    """Every node counts one robot more than saw it."""
+    verdict = fold._verdict
+
+    def generous(hits: Int32s, misses: Int32s, witnesses: Int32s, wanted: int) -> fold.Verdict:
+        return verdict(hits, misses, witnesses + 1, wanted)
+
+    patch.setattr(fold, "_verdict", generous)
+
+
 BUGS: dict[str, tuple[Plant, Callable[[], Scenario], str]] = {
     "arrival order": (arrival_order, lambda: scenario("wifi"), "the fold is not that of the set"),
     "lost retraction": (lost_retraction, lambda: scenario("loops"), "a retraction was lost"),
     "Lamport time": (unchecked_lamport, lambda: scenario("liars"), "a Lamport time is false"),
     "N_c": (one_child_too_many, lambda: scenario("wifi"), "E is wrong"),
     "signature": (unchecked_signature, lambda: scenario("liars"), "a signature is false"),
+    "witness": (one_witness_too_many, lambda: scenario("wifi"), "witnesses are miscounted"),
 }
 
 

@@ -174,7 +174,10 @@ class Invariants:
         return np.asarray(np.where(taken == 0, 1, sums), np.int64)
 
     def _map(self, agent: Agent) -> None:
-        """The fold is that of the set from scratch; nothing is confirmed without witnesses."""
+        """The fold is that of the set from scratch; nothing is confirmed without witnesses.
+
+        Those are counted here once more, from what each author observed.
+        """
         scratch = Consensus(agent.config)
         for tx in transactions_anew(agent):
             scratch.add(tx)
@@ -182,7 +185,12 @@ class Invariants:
             agent.digest() == scratch.digest(), "the fold is not that of the set", f"{agent.ledger}"
         )
         world = agent.map
-        few = world.witnesses < agent.config.fold.witnesses
+        seen = np.zeros(len(world), np.int64)
+        for _, author in sorted(agent.consensus.authors.items()):
+            nodes = agent.consensus.feature_nodes(world.origin, author)
+            seen[np.unique(nodes[nodes >= 0])] += 1
+        self._require(np.array_equal(world.witnesses, seen), "witnesses are miscounted", f"{world}")
+        few = seen < agent.config.fold.witnesses
         self._require(
             not bool((few & (world.states == State.CONFIRMED)).any()),
             "confirmed without witnesses",
