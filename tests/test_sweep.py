@@ -94,6 +94,32 @@ def one_witness_too_many(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(fold, "_verdict", generous)
 
 
+def endless_waiting_room(patch: pytest.MonkeyPatch) -> None:
+    """The waiting room has another limit than the one that is configured."""
+    wait = Ledger._wait
+
+    def patient(self: Ledger, tx: transaction.Transaction, missing: tuple[bytes, ...]) -> None:
+        config = self.config
+        more = msgspec.structs.replace(config.ledger, waiting_transactions=1 << 20)
+        self.config = msgspec.structs.replace(config, ledger=more)
+        wait(self, tx, missing)
+        self.config = config
+
+    patch.setattr(Ledger, "_wait", patient)
+
+
+def forgetful_waiting_room(patch: pytest.MonkeyPatch) -> None:
+    """The bytes of what has left the waiting room go on counting."""
+    leave = Ledger._leave
+
+    def careless(self: Ledger, id_: bytes) -> transaction.Transaction:
+        tx = leave(self, id_)
+        self._waiting_size += len(tx.data)
+        return tx
+
+    patch.setattr(Ledger, "_leave", careless)
+
+
 BUGS: dict[str, tuple[Plant, Callable[[], Scenario], str]] = {
     "arrival order": (arrival_order, lambda: scenario("wifi"), "the fold is not that of the set"),
     "lost retraction": (lost_retraction, lambda: scenario("loops"), "a retraction was lost"),
@@ -101,6 +127,8 @@ BUGS: dict[str, tuple[Plant, Callable[[], Scenario], str]] = {
     "N_c": (one_child_too_many, lambda: scenario("wifi"), "E is wrong"),
     "signature": (unchecked_signature, lambda: scenario("liars"), "a signature is false"),
     "witness": (one_witness_too_many, lambda: scenario("wifi"), "witnesses are miscounted"),
+    "endless room": (endless_waiting_room, lambda: scenario("liars"), "memory"),
+    "forgetful room": (forgetful_waiting_room, lambda: scenario("wifi"), "memory"),
 }
 
 

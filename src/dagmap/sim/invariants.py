@@ -119,6 +119,8 @@ class Invariants:
         limits, sizes = agent.config.ledger, agent.ledger.sizes()
         self._require(sizes.waiting <= limits.waiting_transactions, "memory", f"{sizes}")
         self._require(sizes.waiting_bytes <= limits.waiting_bytes, "memory", f"{sizes}")
+        left = sizes.waiting_bytes or sizes.waited_for
+        self._require(bool(sizes.waiting) or not left, "memory", f"nothing waits, but {sizes}")
         self._require(len(agent.sync.peers) <= MAX_PEERS, "memory", "peers")
 
     def _ledger(self, agent: Agent, looked: _Looked) -> None:
