@@ -82,10 +82,11 @@ class Invariants:
             self._withdrawn(robot, honest)
             chain = honest[0].agent.ledger.chain(robot.author)
             self._require(
-                {tx.id for tx in chain.main} >= robot.own & set(map(_id, robot.agent.ledger)),
+                {tx.id for tx in chain.main} == robot.own,
                 "a transaction was forgotten",
-                f"{honest[0].name} lacks some of {robot.name}'s",
+                f"{honest[0].name} does not hold what {robot.name} issued",
             )
+            self._require(chain.cut is None, "an honest robot was cut", robot.name)
         self._map(honest[0].agent)
         self._require(
             len(set(digests.values())) == 1,
@@ -213,7 +214,3 @@ class Invariants:
                 "a retraction was lost",
                 f"{other.name} holds {int(alive.sum())} points that {robot.name} withdrew",
             )
-
-
-def _id(tx: Transaction) -> TransactionId:
-    return tx.id
