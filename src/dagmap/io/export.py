@@ -219,5 +219,5 @@ def _output_error(path: Path, error: OSError) -> OutputError:
     reason = error.strerror or str(error)
     return OutputError(
         f"{path}: cannot be written ({reason}); make the place writable, free some space, or name "
-        "another one with --out"
+        "another one"
     )
