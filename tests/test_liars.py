@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import msgspec
+import numpy as np
 import pytest
 
-from dagmap import Config, GraphConfig
+from dagmap import Agent, Config, Cycle, GraphConfig, messages, transaction
 from dagmap.config import FoldConfig, TransactionConfig
-from dagmap.model import ConfigError
+from dagmap.identity import Identity
+from dagmap.messages import Transactions
+from dagmap.model import Accepted, ConfigError
 from dagmap.sim.building import SceneConfig
 from dagmap.sim.liars import LIARS, make_liar
 from dagmap.sim.mission import Mission, Report
 from dagmap.sim.network import Link
+from dagmap.sim.robot import Happening, Robot
 from dagmap.sim.scenario import Liars, Scenario
 from dagmap.sim.sensor import SensorConfig
 from dagmap.sim.sweep import attempt
 from dagmap.sim.truth import judge_lies
 from dagmap.sim.walk import MotionConfig
+from dagmap.sync import Peer
 
 ROOM = Scenario(  # everybody looks at the walls of one small room
     name="a room",
@@ -117,6 +122,40 @@ def test_a_fork_is_cut_on_every_robot() -> None:
     liar = mission.fleet.robots["forker00"].author
     cuts = {robot.agent.ledger.chain(liar).cut for robot in mission.honest}
     assert len(cuts) == 1 and cuts != {None}
+
+
+def test_a_forker_shows_no_robot_both_halves() -> None:
+    """Only the others can tell a robot of the half that it was not sent."""
+    forker, whom = make_liar("forker", 0), [bytes([i]) * 8 for i in (1, 2, 3)]
+    agent = Agent(Identity.from_seed(bytes(32)), ROOM.config)
+    for name in whom:
+        agent.sync.peers[name] = Peer()
+    agent.observe(Cycle(stamp=0.0, pose=np.eye(4), points=np.ones((5, 3))), 0.0)
+    agent.tick(5.0)
+    sent = [
+        (out.to, transaction.parse(data, agent.config))
+        for out in forker.send(agent, agent.outbox(), 5.0)
+        for parsed in [messages.parse(out.data, agent.config)[1]]
+        if isinstance(parsed, Transactions)
+        for data in parsed.data
+    ]
+    assert sorted(to or b"" for to, _ in sent) == whom
+    assert len({tx.id for _, tx in sent}) == 2 and len({tx.sequence for _, tx in sent}) == 1
+
+
+def test_a_back_dater_comes_before_what_others_hold() -> None:
+    few = msgspec.structs.replace(ROOM.sensor, points=20)
+    early = []
+
+    def on_event(robot: Robot, happening: Happening) -> None:
+        tx = robot.agent.ledger.find(happening.id) if isinstance(happening, Accepted) else None
+        liar = mission.fleet.robots["back-dater00"]
+        if tx is not None and robot.honest and tx.author == liar.author:
+            early.append(max(other.lamport for other in robot.agent.ledger) - tx.lamport)
+
+    mission = Mission(room("back-dater", 1, seconds=8.0, sensor=few), 1, on_event=on_event)
+    assert mission.run().agreed
+    assert len(early) >= 12 and min(early) >= 2
 
 
 def test_a_flood_stays_within_the_waiting_room() -> None:

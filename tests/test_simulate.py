@@ -15,6 +15,7 @@ import pytest
 from dagmap import Agent
 from dagmap.cli import main
 from dagmap.io.sources import save_cycles
+from dagmap.model import ConfigError
 from dagmap.sim.mission import Mission
 from dagmap.sim.scenario import load_scenario
 from dagmap.sim.sweep import attempt, timeline_of
@@ -105,6 +106,27 @@ def test_recordings_are_found_beside_the_scenario(tmp_path: Path) -> None:
     assert report["transactions"] >= 8
     code, _, err = dagmap("simulate", tmp_path / "real.toml", "--seeds", 2)
     assert code == 2 and "recordings" in err
+
+
+def test_a_place_for_the_timeline_is_looked_at_before_the_work(small: Path) -> None:
+    with patch.object(Mission, "run", side_effect=AssertionError("it ran all the same")):
+        code, _, err = dagmap("simulate", small, "--timeline", small.parent / "none" / "a.txt")
+    assert code == 2 and "there is no such folder" in err.replace("\n", " ")
+
+
+def test_recordings_of_robots_that_are_not_there_are_refused(small: Path) -> None:
+    with pytest.raises(ConfigError, match="recordings of .'red'., but the robots are"):
+        Mission(load_scenario(small), 1, {"red": cycles(0, count=2)})
+
+
+def test_a_liar_that_the_seed_draws_has_its_recording(tmp_path: Path) -> None:
+    for i, name in enumerate(("red.npz", "blue.npz")):
+        save_cycles(tmp_path / name, [replace(c, colors=None) for c in cycles(i, count=5)])
+    text = TEXT.replace("robots = 3", 'robots = 2\nrecordings = ["red.npz", "blue.npz"]')
+    (tmp_path / "real.toml").write_text(text + '[[liars]]\nkind = "any"')
+    code, out, _ = dagmap("simulate", tmp_path / "real.toml", "--seed", 2, "--timeline", "-")
+    liar = next(line.split()[1] for line in out.splitlines() if " r00 " not in line)
+    assert code == 0 and liar != "any00" and out.count(f" {liar} observes ") == 5
 
 
 def test_robots_that_do_not_agree_are_exit_code_1(small: Path) -> None:

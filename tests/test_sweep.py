@@ -9,11 +9,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from dagmap import graph, ledger, transaction
+from dagmap import fold, graph, ledger, transaction
 from dagmap.consensus import Consensus
 from dagmap.contribution import Author
 from dagmap.kernels import lattice
 from dagmap.ledger import Ledger
+from dagmap.model import Int32s
 from dagmap.sim.scenario import Scenario, load_scenario
 from dagmap.sim.sweep import Failure, attempt, minimised, sweep, timeline_of
 
@@ -83,12 +84,51 @@ def unchecked_signature(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(transaction, "signature_holds", lambda key, signature, message: True)
 
 
+def one_witness_too_many(patch: pytest.MonkeyPatch) -> None:
+    """Every node counts one robot more than saw it."""
+    verdict = fold._verdict
+
+    def generous(hits: Int32s, misses: Int32s, witnesses: Int32s, wanted: int) -> fold.Verdict:
+        return verdict(hits, misses, witnesses + 1, wanted)
+
+    patch.setattr(fold, "_verdict", generous)
+
+
+def endless_waiting_room(patch: pytest.MonkeyPatch) -> None:
+    """The waiting room has another limit than the one that is configured."""
+    wait = Ledger._wait
+
+    def patient(self: Ledger, tx: transaction.Transaction, missing: tuple[bytes, ...]) -> None:
+        config = self.config
+        more = msgspec.structs.replace(config.ledger, waiting_transactions=1 << 20)
+        self.config = msgspec.structs.replace(config, ledger=more)
+        wait(self, tx, missing)
+        self.config = config
+
+    patch.setattr(Ledger, "_wait", patient)
+
+
+def forgetful_waiting_room(patch: pytest.MonkeyPatch) -> None:
+    """The bytes of what has left the waiting room go on counting."""
+    leave = Ledger._leave
+
+    def careless(self: Ledger, id_: bytes) -> transaction.Transaction:
+        tx = leave(self, id_)
+        self._waiting_size += len(tx.data)
+        return tx
+
+    patch.setattr(Ledger, "_leave", careless)
+
+
 BUGS: dict[str, tuple[Plant, Callable[[], Scenario], str]] = {
     "arrival order": (arrival_order, lambda: scenario("wifi"), "the fold is not that of the set"),
     "lost retraction": (lost_retraction, lambda: scenario("loops"), "a retraction was lost"),
     "Lamport time": (unchecked_lamport, lambda: scenario("liars"), "a Lamport time is false"),
     "N_c": (one_child_too_many, lambda: scenario("wifi"), "E is wrong"),
     "signature": (unchecked_signature, lambda: scenario("liars"), "a signature is false"),
+    "witness": (one_witness_too_many, lambda: scenario("wifi"), "witnesses are miscounted"),
+    "endless room": (endless_waiting_room, lambda: scenario("liars"), "memory"),
+    "forgetful room": (forgetful_waiting_room, lambda: scenario("wifi"), "memory"),
 }
 
 

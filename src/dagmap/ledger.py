@@ -65,6 +65,7 @@ class Sizes(NamedTuple):
     accepted: int
     waiting: int
     waiting_bytes: int
+    waited_for: int  # ids that waiting transactions lack
 
 
 class Ledger:
@@ -103,7 +104,8 @@ class Ledger:
         yield from (tx for chain in self.chains.values() for tx in chain.proof or ())
 
     def sizes(self) -> Sizes:
-        return Sizes(len(self._known), len(self._waiting), self._waiting_size)
+        waited_for = len(self._waited_for)
+        return Sizes(len(self._known), len(self._waiting), self._waiting_size, waited_for)
 
     def holds(self, id_: TransactionId) -> bool:
         """Whether it is accepted or waiting, so that it need not be looked at again."""

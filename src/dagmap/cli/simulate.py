@@ -45,6 +45,8 @@ class Simulate:
             raise DagmapError("--timeline is of one run; leave out --seeds and name a --seed")
         if self.timeline == Path("-") and self.json:
             raise DagmapError("--timeline - and --json both want the terminal; name a file")
+        if self.timeline is not None and not self.timeline.parent.is_dir():
+            raise DagmapError(f"--timeline {self.timeline}: there is no such folder; make it first")
         scenarios = [load_scenario(path) for path in self.scenarios]
         warm_up(self.console)
         if self.seeds is not None:
@@ -54,7 +56,7 @@ class Simulate:
         return self._simulate(scenarios[0], self.scenarios[0])
 
     def _simulate(self, scenario: Scenario, path: Path) -> int:
-        recordings = _recordings(scenario, path.parent)
+        recordings = _recordings(scenario.drawn(self.seed), path.parent)
         timeline = Timeline(lambda: mission.fleet.now)
         wanted = self.timeline is not None
         mission = Mission(scenario, self.seed, recordings, timeline if wanted else None)

@@ -193,11 +193,16 @@ def _remove_results(path: Path) -> None:
 def atomic_write(path: Path, mode: int = 0o666) -> Iterator[BinaryIO]:
     """Give a file to write to; it takes its name when the block ends well and is gone when not.
 
+    What is no file (a pipe, a terminal, a device) is written to as it is, never replaced.
     mode: who may use it, less what the user's umask takes away.
     Raises OutputError that names the file and the remedy.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}{_PART}")
     try:
+        if path.exists() and not path.is_file() and not path.is_dir():
+            with path.open("wb") as stream:
+                yield stream
+            return
         handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode)
         with open(handle, "wb") as file:
             yield file
@@ -215,5 +220,5 @@ def _output_error(path: Path, error: OSError) -> OutputError:
     reason = error.strerror or str(error)
     return OutputError(
         f"{path}: cannot be written ({reason}); make the place writable, free some space, or name "
-        "another one with --out"
+        "another one"
     )

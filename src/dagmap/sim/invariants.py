@@ -82,10 +82,11 @@ class Invariants:
             self._withdrawn(robot, honest)
             chain = honest[0].agent.ledger.chain(robot.author)
             self._require(
-                {tx.id for tx in chain.main} >= robot.own & set(map(_id, robot.agent.ledger)),
+                {tx.id for tx in chain.main} == robot.own,
                 "a transaction was forgotten",
-                f"{honest[0].name} lacks some of {robot.name}'s",
+                f"{honest[0].name} does not hold what {robot.name} issued",
             )
+            self._require(chain.cut is None, "an honest robot was cut", robot.name)
         self._map(honest[0].agent)
         self._require(
             len(set(digests.values())) == 1,
@@ -119,6 +120,8 @@ class Invariants:
         limits, sizes = agent.config.ledger, agent.ledger.sizes()
         self._require(sizes.waiting <= limits.waiting_transactions, "memory", f"{sizes}")
         self._require(sizes.waiting_bytes <= limits.waiting_bytes, "memory", f"{sizes}")
+        left = sizes.waiting_bytes or sizes.waited_for
+        self._require(bool(sizes.waiting) or not left, "memory", f"nothing waits, but {sizes}")
         self._require(len(agent.sync.peers) <= MAX_PEERS, "memory", "peers")
 
     def _ledger(self, agent: Agent, looked: _Looked) -> None:
@@ -174,7 +177,10 @@ class Invariants:
         return np.asarray(np.where(taken == 0, 1, sums), np.int64)
 
     def _map(self, agent: Agent) -> None:
-        """The fold is that of the set from scratch; nothing is confirmed without witnesses."""
+        """The fold is that of the set from scratch; nothing is confirmed without witnesses.
+
+        Those are counted here once more, from what each author observed.
+        """
         scratch = Consensus(agent.config)
         for tx in transactions_anew(agent):
             scratch.add(tx)
@@ -182,7 +188,12 @@ class Invariants:
             agent.digest() == scratch.digest(), "the fold is not that of the set", f"{agent.ledger}"
         )
         world = agent.map
-        few = world.witnesses < agent.config.fold.witnesses
+        seen = np.zeros(len(world), np.int64)
+        for _, author in sorted(agent.consensus.authors.items()):
+            nodes = agent.consensus.feature_nodes(world.origin, author)
+            seen[np.unique(nodes[nodes >= 0])] += 1
+        self._require(np.array_equal(world.witnesses, seen), "witnesses are miscounted", f"{world}")
+        few = seen < agent.config.fold.witnesses
         self._require(
             not bool((few & (world.states == State.CONFIRMED)).any()),
             "confirmed without witnesses",
@@ -203,7 +214,3 @@ class Invariants:
                 "a retraction was lost",
                 f"{other.name} holds {int(alive.sum())} points that {robot.name} withdrew",
             )
-
-
-def _id(tx: Transaction) -> TransactionId:
-    return tx.id

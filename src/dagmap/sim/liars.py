@@ -7,6 +7,7 @@ A liar stands between its SLAM and its agent (`cycle`) and between its agent and
 from __future__ import annotations
 
 import random
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -79,21 +80,32 @@ class Forker(Honest):
     """Signs a second transaction with the same number and shows each half of the fleet one."""
 
     def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:
-        out = list(outgoing)
+        others, out = sorted(agent.sync.peers), []
         for sent in outgoing:
-            for tx in _own(agent, sent):
+            own = _own(agent, sent) if len(others) > 1 else []
+            out += [Outgoing(sent.data, whom) for whom in others[1::2]] if own else [sent]
+            for tx in own:
                 rival = _sealed(agent, tx.sequence, tx.previous, tx.lamport, tx.references)
-                others = sorted(agent.sync.peers)
                 out += [_packed(agent, rival, whom) for whom in others[::2]]
         return out
 
 
 class BackDater(Honest):
-    """Refers to nobody, so that all it says sorts before what the others say at the time."""
+    """Refers to nobody and speaks late, so that what it says sorts before what others hold."""
+
+    LATE = 3.0  # s
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed)
+        self._held: deque[tuple[float, Outgoing]] = deque()
 
     def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:
         vars(agent.ledger)["tips"] = lambda me, most: ()
-        return outgoing
+        self._held.extend((now + self.LATE, sent) for sent in outgoing)
+        due = []
+        while self._held and self._held[0][0] <= now:
+            due.append(self._held.popleft()[1])
+        return due
 
 
 class FalseDater(Honest):

@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 import msgspec
 
-from ..model import Accepted, Cycle, Forked, Issued, Rejected, State
+from ..model import Accepted, ConfigError, Cycle, Forked, Issued, Rejected, State
 from ..worldmap import WorldMap
 from .fleet import Check, Fleet
 from .liars import make_liar
@@ -79,6 +79,9 @@ class Mission:
         self._scene: Scene | None = None
         self._walkers: dict[str, Walker] = {}
         self._recordings = recordings or {}
+        unknown = sorted(self._recordings.keys() - set(self.scenario.names))
+        if unknown:
+            raise ConfigError(f"recordings of {unknown}, but the robots are {self.scenario.names}")
         if not self._recordings:
             self._scene = self._build_scene()
         network = Network(scenario.link, seed, self.scenario.partitions, self._where)
