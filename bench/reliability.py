@@ -193,7 +193,7 @@ def _lossy_row(topology: str, loss: float, reports: list[Report]) -> dict[str, A
     """Runs in which some robot was out of everybody's reach are left out, and counted."""
     joined = [r for r in reports if r.ideal_s is not None]
     took = [r.agreement_periods for r in joined if r.agreement_periods is not None]
-    over = [r.bytes_received / r.bytes_minimum for r in joined]
+    over = [r.bytes_carried / r.bytes_minimum for r in joined]
     period = SMALL.config.sync.announce_period
     p50, p99 = np.percentile(took, [50, 99]).tolist() if took else (None, None)
     return {

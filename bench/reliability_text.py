@@ -66,8 +66,8 @@ Then they have time to agree: from when the last transaction was issued until th
 everything, in announcement periods ({period:g} s), over {runs} seeds. *Ideal* is a flood without
 loss over the same links, each hop one mean delay. In *all hear all* a transaction comes at once
 or by repair; in *a chain* each robot stands in one room of a row and hears the next ones, so that
-news travels by announcement, question and answer. *Bytes* are all that robots received, over one
-copy of each transaction for everybody but its author (median).
+news travels by announcement, question and answer. *Bytes* are all copies sent, lost or not, over
+one copy of each transaction for everybody but its author (median).
 
 {loss}
 
@@ -146,7 +146,7 @@ def _sweep(sweep: dict[str, Any]) -> str:
 
 def _hundred(run: dict[str, Any]) -> str:
     end = "one digest" if run["agreed"] else "**no agreement**"
-    over = run["bytes_received"] / max(1, run["bytes_minimum"])
+    over = run["bytes_carried"] / max(1, run["bytes_minimum"])
     return (
         f"{run['robots']} robots, {run['mission_s']:,.0f} s in {run['wall_s']:,.0f} s (wall): "
         f"{run['transactions']:,} transactions, {run['messages']:,} messages "

@@ -334,6 +334,9 @@ def test_bytes_are_counted_against_one_copy_for_everybody() -> None:
     size = sum(len(tx.data) for tx in mission.honest[0].agent.ledger)
     assert report.bytes_minimum == 2 * size
     assert report.bytes_minimum < report.bytes_received < 3 * report.bytes_minimum
+    assert report.bytes_received <= report.bytes_carried < 1.05 * report.bytes_received
+    lossy = Mission(changed(CALM, link=Link(loss=0.5)), 1).run()
+    assert lossy.bytes_carried > 1.5 * lossy.bytes_received, "what is lost was sent all the same"
     assert report.bytes_received == sum(robot.bytes_received for robot in mission.honest)
 
 

@@ -141,7 +141,7 @@ def _show(report: Report) -> None:
 def _rows(report: Report) -> list[tuple[str, str]]:
     agreed = "never" if report.agreement_s is None else f"{report.agreement_s:.2f} s"
     ideal = "" if report.ideal_s is None else f" (a flood without loss: {report.ideal_s:.2f} s)"
-    over = report.bytes_received / max(1, report.bytes_minimum)
+    over = report.bytes_carried / max(1, report.bytes_minimum)
     states = ", ".join(f"{report.map[s.name.lower()]:,} {s.name.lower()}" for s in State)
     rows = [
         ("robots", f"{report.robots}, {report.liars} of them liars"),
@@ -149,7 +149,10 @@ def _rows(report: Report) -> list[tuple[str, str]]:
         ("digest", f"{report.digest[:16]}... on all" if report.agreed else "THE ROBOTS DISAGREE"),
         ("map", f"{report.map['nodes']:,} nodes: {states}"),
         ("transactions", f"{report.transactions:,}"),
-        ("received", f"{report.bytes_received / 1000:,.0f} kB, {over:.2f} times the least needed"),
+        (
+            "copies sent",
+            f"{report.bytes_carried / 1000:,.0f} kB, {over:.2f} times the least needed",
+        ),
         ("messages", f"{report.messages:,}, {report.messages_per_s:,.0f} a second of wall time"),
         ("time", f"{report.simulated_s:,.1f} s simulated in {report.wall_s:.1f} s"),
     ]

@@ -41,6 +41,7 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     messages_per_s: float
     transactions: int  # of honest robots
     bytes_sent: int  # a broadcast once
+    bytes_carried: int  # one copy for every robot in reach, lost or not
     bytes_received: int
     bytes_minimum: int  # one copy of every transaction for every honest robot but its author
     divergence: list[tuple[float, float]]  # (s, largest share of transactions that one lacks)
@@ -254,6 +255,7 @@ class Mission:
             messages_per_s=self.fleet.delivered / max(wall, 1e-9),
             transactions=sum(len(robot.own) for robot in honest),
             bytes_sent=sum(robot.bytes_sent for robot in robots),
+            bytes_carried=self._network.carried,
             bytes_received=sum(robot.bytes_received for robot in honest),
             bytes_minimum=sum(unique.values()),
             divergence=self._divergence,

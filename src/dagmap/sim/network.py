@@ -87,6 +87,7 @@ class Network:
         self._random = random.Random(seed)
         self._free_at: dict[str, float] = {}  # when a robot's radio has sent what it holds
         self.dropped = 0  # messages that met a full queue
+        self.carried = 0  # bytes of all copies put on the air for robots in reach, lost or not
 
     def connects(self, sender: str, receiver: str, now: float) -> bool:
         """Whether one robot hears another."""
@@ -109,6 +110,7 @@ class Network:
             if not self.connects(sender, receiver, now):
                 continue
             for _ in range(1 + (link.duplicate > 0 and chance.random() < link.duplicate)):
+                self.carried += size
                 delay = chance.uniform(*link.delay)
                 if link.tail:
                     delay += chance.expovariate(1 / link.tail)
