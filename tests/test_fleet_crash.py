@@ -80,6 +80,7 @@ class TestKill:
                         witness.wait_for_news()
                     witness.watch(rng.uniform(0.0, 0.5))
                     if i % 7 == 1:  # leaves a checkpoint: older than the ledger at later kills
+                        until(robot.status, "an answer")
                         assert robot.stop() == 0
                         assert (robot.data / "checkpoint").is_file()
                     else:
