@@ -117,3 +117,38 @@ def test_one_that_does_not_fit_is_not_used(
         identity = scene.agent("another").identity
     assert checkpoints.load(checkpoint, identity, config, found) is None
     assert Agent.restore(identity, config, found.values(), checkpoint=checkpoint).ledger
+
+
+def test_what_another_release_wrote_is_not_used(
+    stored: Stored, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its fold may be another: the robot would keep another map than all others, for ever."""
+    ids, data = list(stored), list(stored.values())
+    checkpoint = listener(data).checkpoint(ids)
+    monkeypatch.setattr(checkpoints, "__version__", "0.0.9")
+    identity = scene.agent("listener").identity
+    assert checkpoints.load(checkpoint, identity, scene.QUICK, dict(stored)) is None
+
+
+def test_classes_that_are_gone_are_no_reason_to_fail(
+    stored: Stored, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ids, data = list(stored), list(stored.values())
+    checkpoint = listener(data).checkpoint(ids)
+    monkeypatch.delattr("dagmap.ledger.Chain")
+    identity = scene.agent("listener").identity
+    assert checkpoints.load(checkpoint, identity, scene.QUICK, dict(stored)) is None
+
+
+def test_what_was_never_stored_does_not_come_back() -> None:
+    """The disk refused a transaction, then took the checkpoint: nobody was told of the first."""
+    agent = scene.agent("robot")
+    said: Stored = {}
+    for cycle in scene.cycles(3, count=8):
+        events = agent.observe(cycle, now=cycle.stamp)
+        said |= {event.id: event.data for event in events if isinstance(event, Accepted)}
+    assert len(agent.ledger) == len(said) > 1
+    said.popitem()
+    checkpoint = agent.checkpoint(list(said))
+    again = Agent.restore(agent.identity, agent.config, said.values(), checkpoint=checkpoint)
+    assert [tx.id for tx in again.ledger] == list(said)

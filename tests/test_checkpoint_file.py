@@ -84,6 +84,16 @@ def test_without_a_good_one_the_ledger_is_read(
         assert judged == len(store) and again.digest() == agent.digest()
 
 
+def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
+    """Each is as large as the map, and named after a process that is no more."""
+    agent, store = mapped(tmp_path, 1)
+    with store:
+        (tmp_path / ".checkpoint.77.part").write_bytes(b"half")
+        CheckpointFile(store, Log(io.StringIO())).write(agent)
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"checkpoint", "ledger.db"}
+
+
 def test_trouble_with_it_is_logged_and_no_more(tmp_path: Path) -> None:
     agent, store = mapped(tmp_path)
     (tmp_path / "checkpoint").mkdir()

@@ -219,8 +219,9 @@ def test_folders_that_are_damaged_or_mixed_up(fleet: Fleet, tmp_path: Path) -> N
     for name in ("certificate", "robot.toml", "robot.key"):
         theirs = (tmp_path / "theirs" / name).read_bytes()
         swapped(mine / name, theirs, robot, "is not one of the fleet 'office' of robot.toml")
-    swapped(mine / "certificate", b"zz", robot, "certificate: not hexadecimal")
-    swapped(mine / "certificate", b"\xff", robot, "certificate: not hexadecimal")
+    swapped(mine / "certificate", b"zz", robot, "certificate: no certificate; take")
+    swapped(mine / "certificate", b"\xff", robot, "certificate: no certificate; take")
+    swapped(mine / "certificate", b"ff" * 70, robot, "certificate: no certificate; take")
     swapped(mine / "tls.pem", b"-", robot, "tls.pem: no X.509 certificate")
     swapped(mine / "robot.key", b"junk", robot, "robot.key: no Ed25519 private key")
     swapped(mine / "robot.toml", b"x = 1", robot, "robot.toml: .*unknown field `x`")

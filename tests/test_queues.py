@@ -11,7 +11,7 @@ import dagmap.agent
 from dagmap import Accepted, Config, Cycle
 from dagmap.agent import Parsers
 from dagmap.io.queues import Inbox, Question, Rates, SendQueue, Throttle
-from dagmap.messages import Heads, Transactions, Want, encode
+from dagmap.messages import Heads, Kind, Transactions, Want, encode, kind_of
 from dagmap.model import Outgoing
 from scene import agent as scene_agent
 from scene import cycles
@@ -112,6 +112,30 @@ class TestSendQueue:
         queue.put(transactions)
         assert queue.dropped == 3 and queue.size <= 2_000
         assert [queue.take(), queue.take()] == transactions[3:]
+
+    def test_announcements_that_were_taken_are_not_dropped_again(self) -> None:
+        queue = SendQueue(2_000)
+        queue.put([Outgoing(heads(1)), Outgoing(message(900)), Outgoing(heads(2))])
+        assert queue.take() == Outgoing(heads(1))
+        last = [Outgoing(message(901)), Outgoing(message(902))]
+        queue.put(last)  # the second announcement leaves, and the oldest message
+        queue.close()
+        assert [queue.take() for _ in range(3)] == [*last, None]
+        assert queue.dropped == 2 and queue.size == 0
+
+    def test_a_full_queue_is_not_searched(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """The agent's thread puts: where a link stalls for long, that must stay cheap."""
+        looked = 0
+
+        def counted(data: bytes) -> Kind | None:
+            nonlocal looked
+            looked += 1
+            return kind_of(data)
+
+        monkeypatch.setattr("dagmap.io.queues.kind_of", counted)
+        queue = SendQueue(100_000)
+        queue.put(Outgoing(message(100)) for _ in range(1_100))
+        assert queue.dropped > 0 and looked == 1_100
 
     def test_taking_waits_for_something(self) -> None:
         queue, out = SendQueue(1_000), Outgoing(heads(1))

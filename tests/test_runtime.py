@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from chains import Author
 from dagmap import Agent
 from dagmap.io.log import Log
 from dagmap.io.player import Player
@@ -113,6 +114,17 @@ class TestRuntime:
         runtime.run(until_agreed=0.05)
         assert runtime.counts.refused.total() == 10 and not disk.stored
         assert log.getvalue().count("event=refused") == 1
+
+    def test_many_forks_are_one_line(self) -> None:
+        """In an open fleet keys cost nothing: who forks a thousand does not fill the disk."""
+        runtime, _, _, log = make()
+        config, here = runtime.agent.config, runtime.agent.ledger
+        for liar in (Author(f"liar {i}", config) for i in range(10)):
+            both = tuple(liar.make(after=[], features=n).data for n in (2, 3))
+            runtime.inbox.put_message(encode(Transactions(both), config, liar.identity.author))
+        runtime.run(until_agreed=0.05)
+        assert [chain.cut for chain in here.chains.values()] == [0] * 10
+        assert log.getvalue().count('event="fork proven"') == 1
 
     def test_a_bad_cycle_does_not_stop_it(self) -> None:
         runtime, _, _, log = make()

@@ -73,6 +73,24 @@ class TestReach:
         assert first.traffic.table()["sent"]["want"] == {"messages": 3, "bytes": 3 * size}
         assert second.traffic.bytes("received") == third.traffic.bytes("received") == 2 * size
 
+    def test_a_message_that_is_not_taken_silences_nobody(
+        self, opened: ExitStack, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (a, _), session = station(opened, NAMES[0], free_port()), SimpleNamespace()
+        taken: list[bytes] = []
+
+        def put(key: str, data: bytes, **options: object) -> None:
+            if data == b"first":
+                raise a._zenoh.ZError("no room")
+            taken.append(data)
+
+        session.put, session.is_closed = put, lambda: False
+        with monkeypatch.context() as patch:
+            patch.setattr(a, "_session", session)
+            a.send([Outgoing(b"first", None), Outgoing(b"second", None)])
+            until(lambda: taken == [b"second"], "the second message")
+        assert a.dropped == 1
+
     def test_who_leaves_is_no_longer_here(self, opened: ExitStack) -> None:
         port = free_port()
         first, _ = station(opened, NAMES[0], port)

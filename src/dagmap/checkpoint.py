@@ -18,17 +18,21 @@ from typing import cast
 
 import msgspec
 
+from . import __version__
 from .config import Config
 from .consensus import Consensus
 from .identity import Identity
 from .ledger import Ledger
 from .model import TransactionId
 
-VERSION = 1  # of what is pickled: any change to the classes of the ledger or the fold counts it up
+# Of what is pickled: any change to the classes of the ledger or the fold counts it up. Between
+# releases the fold itself may change: what another release has folded is never taken over.
+VERSION = 2
 
 
 class _Head(msgspec.Struct, frozen=True):
     version: int
+    release: str
     config: bytes
     count: int  # transactions of the store, from its beginning
     stored: bytes  # BLAKE2b-256 over their ids, in the store's order
@@ -50,24 +54,29 @@ def load(
 ) -> tuple[Ledger, Consensus, int] | None:
     """The state and how many of the store's transactions (in its order) it stands for.
 
-    None where it is damaged, of another robot, version or configuration, or of another store.
+    None where it is damaged, of another robot, version or configuration, of another store, or of
+    classes that are not here any more; and where it holds what the store never got: to go on from
+    that would leave a gap in the store.
     """
     body = memoryview(data)[32:]
     if len(data) < 36 or data[:32] != _mac(identity, body):
         return None
     size = int.from_bytes(body[:4], "little")
-    head = msgspec.msgpack.decode(body[4 : 4 + size], type=_Head)
-    stored = list(islice(transactions, head.count))
-    if head != _head(config, stored):
+    try:
+        head = msgspec.msgpack.decode(body[4 : 4 + size], type=_Head)
+        if head != _head(config, list(islice(transactions, head.count))):
+            return None
+        unpickler = _Unpickler(io.BytesIO(body[4 + size :]), transactions)
+        ledger, consensus = cast("tuple[Ledger, Consensus]", unpickler.load())
+        whole = all(tx.id in transactions for tx in ledger)
+    except Exception:  # noqa: BLE001 - what another version has written may fail in any way
         return None
-    unpickler = _Unpickler(io.BytesIO(body[4 + size :]), transactions)
-    ledger, consensus = cast("tuple[Ledger, Consensus]", unpickler.load())
-    return ledger, consensus, head.count
+    return (ledger, consensus, head.count) if whole else None
 
 
 def _head(config: Config, stored: Sequence[TransactionId]) -> _Head:
     over_all = hashlib.blake2b(b"".join(stored), digest_size=32).digest()
-    return _Head(VERSION, msgspec.json.encode(config), len(stored), over_all)
+    return _Head(VERSION, __version__, msgspec.json.encode(config), len(stored), over_all)
 
 
 def _mac(identity: Identity, body: bytes | memoryview) -> bytes:

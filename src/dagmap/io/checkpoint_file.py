@@ -23,6 +23,9 @@ class CheckpointFile:
         self._store, self._log = store, log
         self._held = 0  # transactions in the last one
         self._written = time.monotonic()
+        for part in self.path.parent.glob(".checkpoint.*.part"):  # of a process that was killed
+            with suppress(OSError):
+                part.unlink()
 
     def keep(self, agent: Agent) -> None:
         """Write it anew, where enough has come since the last one."""

@@ -13,7 +13,8 @@ import msgspec
 from ..agent import Agent
 from ..identity import Identity
 from ..model import StoreError
-from ..transaction import id_of
+from ..transaction import glance, id_of
+from ..wire import Refusal
 from . import keys
 from .checkpoint_file import read_checkpoint
 from .settings import Settings
@@ -60,7 +61,7 @@ def open_folder(settings: Settings) -> tuple[Identity, Store]:
     if not path.exists():
         if (path.parent / (_MADE if closed else _KEY)).exists():
             raise StoreError(
-                f"{path}: the ledger of the robot's key is gone; restore it from a backup, or "
+                f"{path}: the ledger of the robot's key is gone; put back its newest backup, or "
                 f"{f'enroll the robot anew and remove {_MADE}' if closed else f'remove {_KEY} too'}"
                 ": it then starts as a new one. Under its old key it would sign its numbers twice"
             )
@@ -68,7 +69,13 @@ def open_folder(settings: Settings) -> tuple[Identity, Store]:
     if identity is None:
         identity = load_identity(path.parent)
     elif not (path.parent / _MADE).exists():
-        _write_secret(path.parent / _MADE, identity.author.hex())
+        try:
+            _write_secret(path.parent / _MADE, identity.author.hex())
+        except OSError as error:
+            raise StoreError(
+                f"{path.parent / _MADE}: cannot be written ({error.strerror}); make the folder "
+                "writable, or free some space"
+            ) from None
     return identity, Store.open(path, fleet, identity.author)
 
 
@@ -82,7 +89,7 @@ def restore(settings: Settings, identity: Identity, store: Store, track: Track) 
         config = msgspec.structs.replace(config, name=identity.name or "")
     tracked = track(store, len(store))
     agent = Agent.restore(identity, config, tracked, checkpoint=read_checkpoint(store))
-    lost = sum(agent.ledger.find(id_of(data)) is None for data in store)
+    lost = sum(_lacks(agent, data) for data in store)
     if lost:
         raise StoreError(
             f"{store.path}: {lost} of {len(store)} transactions do not hold under this "
@@ -90,6 +97,21 @@ def restore(settings: Settings, identity: Identity, store: Store, track: Track) 
             "[transaction], graph.n_p, graph.n_c_max): give it back those, or another data folder"
         )
     return agent
+
+
+def _lacks(agent: Agent, data: bytes) -> bool:
+    """Whether the agent has dropped what was stored.
+
+    Of a forked author it may: what once proved the fork need not follow from anything, and is let
+    go of once a lower proof is known.
+    """
+    if agent.ledger.find(id_of(data)) is not None:
+        return False
+    try:
+        author, _ = glance(data)
+    except Refusal:
+        return True
+    return agent.ledger.chain(author).cut is None
 
 
 def next_session(agent: Agent) -> int:
@@ -100,7 +122,7 @@ def next_session(agent: Agent) -> int:
 
 
 def _write_secret(path: Path, text: str) -> None:
-    """A file for this user only, there as a whole or not at all."""
+    """A file for this user only, there as a whole or not at all. Raises OSError."""
     part = path.with_suffix(".part")
     with suppress(FileNotFoundError):
         part.unlink()

@@ -238,9 +238,13 @@ def load_identity(folder: Path) -> Identity:
     key, path = _private_key(folder / "robot.key"), folder / "certificate"
     try:
         certificate = bytes.fromhex(_read(path).decode())
+        identity = Identity.from_seed(key.private_bytes_raw(), certificate)
+        named = bool(identity.name)  # bytes of it may be no text
     except ValueError:
-        raise KeysError(f"{path}: not hexadecimal; take the file as it was enrolled") from None
-    return Identity.from_seed(key.private_bytes_raw(), certificate)
+        named = False
+    if not named:
+        raise KeysError(f"{path}: no certificate; take the file as it was enrolled")
+    return identity
 
 
 def _private_key(path: Path) -> Ed25519PrivateKey:

@@ -184,7 +184,9 @@ class SendQueue:
     def __init__(self, most: int) -> None:
         self._most = most
         self._change = threading.Condition()
-        self._queue: deque[Outgoing] = deque()
+        self._queue: OrderedDict[int, Outgoing] = OrderedDict()  # by a number that only rises
+        self._heads: deque[int] = deque()  # of the announcements among them
+        self._number = 0
         self._size = 0
         self._closed = False
         self.dropped = 0
@@ -192,7 +194,10 @@ class SendQueue:
     def put(self, messages: Iterable[Outgoing]) -> None:
         with self._change:
             for out in messages:
-                self._queue.append(out)
+                self._queue[self._number] = out
+                if kind_of(out.data) is Kind.HEADS:
+                    self._heads.append(self._number)
+                self._number += 1
                 self._size += len(out.data)
             while self._size > self._most:
                 self._drop()
@@ -204,7 +209,9 @@ class SendQueue:
             self._change.wait_for(lambda: self._closed or bool(self._queue))
             if not self._queue:
                 return None
-            out = self._queue.popleft()
+            number, out = self._queue.popitem(last=False)
+            if self._heads and self._heads[0] == number:
+                self._heads.popleft()
             self._size -= len(out.data)
             return out
 
@@ -220,8 +227,6 @@ class SendQueue:
         return self._size
 
     def _drop(self) -> None:
-        heads = (i for i, out in enumerate(self._queue) if kind_of(out.data) == Kind.HEADS)
-        place = next(heads, 0)
-        self._size -= len(self._queue[place].data)
-        del self._queue[place]
+        number = self._heads.popleft() if self._heads else next(iter(self._queue))
+        self._size -= len(self._queue.pop(number).data)
         self.dropped += 1

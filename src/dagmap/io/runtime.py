@@ -212,22 +212,23 @@ class Runtime:
             elif isinstance(event, Rejected):
                 self._note_refusal(event)
             elif isinstance(event, Forked):
-                mine = event.author == self.agent.identity.author
-                self._log.write(
-                    "error" if mine else "warning",
-                    "own key was used twice" if mine else "fork proven",
-                    author=event.author.hex(),
-                    sequence=event.sequence,
-                    consequence="this robot issues nothing more; give it a new data folder"
-                    if mine
-                    else "nothing of this author from there on counts",
-                )
+                self._note_fork(event)
             elif isinstance(event, Revoked):
                 self._note_revocation(event)
         if time.monotonic() >= self._next_state:
             self._next_state = time.monotonic() + _STATE_PERIOD
             self._log.write("info", "state", **self._state())
             self._keep_state(self.agent)
+
+    def _note_fork(self, event: Forked) -> None:
+        where = {"author": event.author.hex(), "sequence": event.sequence}
+        if event.author == self.agent.identity.author:
+            consequence = "this robot issues nothing more; give it a new data folder"
+            self._log.write("error", "own key was used twice", **where, consequence=consequence)
+            return
+        consequence = "nothing of this author from there on counts"
+        # Seldom: in an open fleet anybody can be as many authors as he likes, and fork them all.
+        self._log.seldom("warning", "fork proven", "fork", **where, consequence=consequence)
 
     def _note_revocation(self, event: Revoked) -> None:
         mine, lifted = event.author == self.agent.identity.author, event.count is None

@@ -27,8 +27,9 @@ _SELECT = "SELECT position, id, data FROM transactions WHERE position > ? ORDER 
 _COUNT = "SELECT count(*) FROM transactions NOT INDEXED"  # an index may be damaged on its own
 _BUSY = 1.0  # s to wait for another process that is just closing the file
 _AFRESH = (
-    "restore it from a backup, or move it away and let the robot copy the ledger from a neighbour "
-    "before it maps again: a robot that starts anew under the same key forks its own chain"
+    "give the robot a new data folder (in a closed fleet enroll it anew): it starts as a new one. "
+    "A backup helps only where it holds all that the robot has ever sent: from an older one it "
+    "would sign its numbers twice"
 )
 _REMEDIES = {  # by what SQLite says; its error codes are not in Python 3.10
     "malformed": f"the file is damaged; {_AFRESH}",

@@ -75,6 +75,7 @@ class Transport:
         self._prefix = f"dagmap/{fleet_id.hex()}"
         self._here: set[AuthorId] = set()
         self._queue = SendQueue(network.send_bytes)
+        self._refused = 0  # messages that Zenoh did not take
         self.traffic = Traffic()
         self._session = _open(self._zenoh, network, folder)
         self._declared = self._declare()
@@ -97,8 +98,8 @@ class Transport:
 
     @property
     def dropped(self) -> int:
-        """Messages that never left because too many waited."""
-        return self._queue.dropped
+        """Messages that never left: too many waited, or Zenoh did not take one."""
+        return self._queue.dropped + self._refused
 
     def close(self, patience: float = 1.0) -> None:
         """Send what waits, for so many seconds at most, and leave. Closing twice is harmless.
@@ -167,8 +168,11 @@ class Transport:
             where = "all" if out.to is None else f"to/{out.to.hex()}"
             try:
                 self._session.put(f"{self._prefix}/{where}", out.data, **options)
-            except self._zenoh.ZError:
-                return  # the session was closed meanwhile; what others lack they ask for again
+            except self._zenoh.ZError:  # what others lack they ask for again
+                if self._session.is_closed():
+                    return
+                self._refused += 1
+                continue
             self.traffic.count("sent", out.data)
 
 
