@@ -211,7 +211,9 @@ def test_a_changed_byte_of_data_is_noticed(tmp_path: Path) -> None:
     with Store.open(path, FLEET) as store:
         reader = iter(store)
         assert next(reader) == entry(1)[1]
-        with pytest.raises(StoreError, match=r"a\.db: entry 2 does not match its id.*neighbour"):
+        with pytest.raises(
+            StoreError, match=r"a\.db: entry 2 does not match its id.*new data folder"
+        ):
             next(reader)
 
 
@@ -223,7 +225,10 @@ def test_a_corrupt_page_is_noticed_before_anything_is_appended(tmp_path: Path) -
     pages = len(raw) // 4096
     raw[4096 * (pages // 2) : 4096 * (pages // 2) + 200] = bytes(range(200))
     path.write_bytes(raw)
-    with pytest.raises(StoreError, match=r"a\.db: .*damaged.*neighbour"), Store.open(path, FLEET):
+    with (
+        pytest.raises(StoreError, match=r"a\.db: .*damaged.*new data folder"),
+        Store.open(path, FLEET),
+    ):
         pass
 
 

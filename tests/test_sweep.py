@@ -86,12 +86,12 @@ def unchecked_signature(patch: pytest.MonkeyPatch) -> None:
 
 def one_witness_too_many(patch: pytest.MonkeyPatch) -> None:
     """Every node counts one robot more than saw it."""
-    verdict = fold._verdict
+    verdict = fold.verdict_of
 
     def generous(hits: Int32s, misses: Int32s, witnesses: Int32s, wanted: int) -> fold.Verdict:
         return verdict(hits, misses, witnesses + 1, wanted)
 
-    patch.setattr(fold, "_verdict", generous)
+    patch.setattr(fold, "verdict_of", generous)
 
 
 def endless_waiting_room(patch: pytest.MonkeyPatch) -> None:

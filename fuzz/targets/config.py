@@ -176,6 +176,7 @@ def seeds() -> Iterable[bytes]:
     yield b'store.path = "a"\nmetrics.listen = "9464"\nnetwork.mode = "client"\n'
     yield _written(Scenario())
     yield b"store.path = 'a'\n"
+    yield b"store.path = 'a'\nnetwork.receive_bytes_per_second_per_robot = 65536\n"
     yield from _WRONG
     yield b"[clocks]\n[scene]\nrooms = [1, 1]\n[sensor]\n[motion]\n[link]\n"
     yield Scenario(
