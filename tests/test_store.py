@@ -212,7 +212,7 @@ def test_a_changed_byte_of_data_is_noticed(tmp_path: Path) -> None:
         reader = iter(store)
         assert next(reader) == entry(1)[1]
         with pytest.raises(
-            StoreError, match=r"a\.db: entry 2 does not match its id.*new data folder"
+            StoreError, match=r"a\.db: entry 2 does not match its id.*data folder"
         ):
             next(reader)
 
@@ -226,7 +226,7 @@ def test_a_corrupt_page_is_noticed_before_anything_is_appended(tmp_path: Path) -
     raw[4096 * (pages // 2) : 4096 * (pages // 2) + 200] = bytes(range(200))
     path.write_bytes(raw)
     with (
-        pytest.raises(StoreError, match=r"a\.db: .*damaged.*new data folder"),
+        pytest.raises(StoreError, match=r"a\.db: .*damaged.*data folder"),
         Store.open(path, FLEET),
     ):
         pass
