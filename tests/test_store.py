@@ -211,9 +211,7 @@ def test_a_changed_byte_of_data_is_noticed(tmp_path: Path) -> None:
     with Store.open(path, FLEET) as store:
         reader = iter(store)
         assert next(reader) == entry(1)[1]
-        with pytest.raises(
-            StoreError, match=r"a\.db: entry 2 does not match its id.*data folder"
-        ):
+        with pytest.raises(StoreError, match=r"a\.db: entry 2 does not match its id.*data folder"):
             next(reader)
 
 
