@@ -92,6 +92,7 @@ def judge_lies(
     kept = before.states[was] != State.REJECTED
     lost = kept & (states[now] == State.REJECTED)
     proven = before.hits > alone.against(origin) + liars * say  # whatever misses they add
+    proven &= before.states != State.REJECTED  # with no liar, a robot's own record may do that
     survives = np.zeros(len(before.states), np.bool_)
     survives[was[~(states[now] == State.REJECTED)]] = True
     seen = np.zeros(len(before.states), np.bool_)
