@@ -172,6 +172,7 @@ class TestRuntime:
         timer = threading.Timer(0.1, runtime.stop)
         timer.start()
         runtime.run()  # without an end of its own
+        assert timer.finished.is_set(), "it ran until it was told"
         timer.join()
 
     def test_a_broken_recording_is_the_end(self, tmp_path: Path) -> None:
@@ -205,6 +206,7 @@ class TestAgreement:
         speaker = threading.Timer(0.1, runtime.inbox.put_message, [heads])
         speaker.start()
         runtime.run(until_agreed=0.05)
+        assert speaker.finished.is_set(), "it waited for the one in reach"
         speaker.join()
 
     def test_bytes_that_wait_keep_it_going(self) -> None:
@@ -271,6 +273,7 @@ class TestLog:
         log = Log(stream)
         stream.close()
         log.write("info", "said to nobody")
+        assert stream.closed
 
 
 def _transactions(out: Outgoing) -> tuple[bytes, ...]:
