@@ -5,9 +5,9 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from types import TracebackType
 
 from ..model import NetworkError
+from .closing import Closing
 from .runtime import Runtime
 from .transport import Transport
 
@@ -63,7 +63,7 @@ def _families(
     yield "refused_total", "counter", "Foreign bytes that were refused.", refused
 
 
-class MetricsServer:
+class MetricsServer(Closing):
     """Serves the metrics on a thread of its own."""
 
     def __init__(self, address: tuple[str, int], runtime: Runtime, transport: Transport) -> None:
@@ -105,14 +105,3 @@ class MetricsServer:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
-
-    def __enter__(self) -> MetricsServer:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()

@@ -9,11 +9,11 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from ..agent import Agent
 from ..model import AuthorId, DagmapError, State, StoreError
+from .closing import Closing
 from .queues import Inbox, Question
 from .runtime import Runtime
 from .transport import Transport
@@ -85,7 +85,7 @@ def _name(agent: Agent, author: AuthorId) -> str:
     return (known.name if known is not None else None) or author.hex()
 
 
-class StatusServer:
+class StatusServer(Closing):
     """Answers everybody who may open the socket: this user. One thread, one asker at a time."""
 
     def __init__(self, path: Path, inbox: Inbox) -> None:
@@ -118,17 +118,6 @@ class StatusServer:
         self._socket.close()
         self._thread.join()
         self._path.unlink(missing_ok=True)
-
-    def __enter__(self) -> StatusServer:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _serve(self) -> None:
         while not self._closed.is_set():

@@ -13,9 +13,9 @@ import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 
 from ..model import AuthorId, StoreError, TransactionId
+from .closing import Closing
 
 FORMAT = 1
 _BATCH = 256  # rows read at once, so that a long ledger never lies in memory twice
@@ -42,7 +42,7 @@ _REMEDIES = {  # by what SQLite says; its error codes are not in Python 3.10
 }
 
 
-class Store:
+class Store(Closing):
     """An append-only list of (id, data), in order of insertion. Use it from one thread at a time.
 
     Every method raises StoreError that names the file, what went wrong and what helps.
@@ -136,17 +136,6 @@ class Store:
             database, self._database = self._database, None
             with _explained(self.path, "cannot be closed"):
                 database.close()
-
-    def __enter__(self) -> Store:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     @property
     def _in_use(self) -> sqlite3.Connection:

@@ -15,11 +15,11 @@ from collections.abc import Iterable
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from ..messages import MAX_MESSAGE, kind_of, sender_of
 from ..model import AuthorId, NetworkError, Outgoing
+from .closing import Closing
 from .queues import Inbox, SendQueue
 from .settings import NetworkConfig, TlsConfig
 
@@ -63,7 +63,7 @@ class Traffic:
         return out
 
 
-class Transport:
+class Transport(Closing):
     """One robot's place on the network. `send` never waits; what arrives goes into the inbox."""
 
     def __init__(
@@ -115,17 +115,6 @@ class Transport:
     def _leave(self) -> None:
         with suppress(self._zenoh.ZError):  # it gave up on a link; the process ends anyway
             self._session.close()  # type: ignore[no-untyped-call]
-
-    def __enter__(self) -> Transport:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _declare(self) -> list[object]:
         """What the session is to keep: two subscriptions, the token and those of the others."""
