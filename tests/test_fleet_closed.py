@@ -134,7 +134,7 @@ class TestStrangers:
         b = enroll(nursery, fleet, "b", recordings[1], a)
         late = enroll(nursery, fleet, "late", recordings[2], a, b)
         robot, key = keys.open_robot(late.keys), keys._private_key(fleet.folder / "fleet.key")
-        expired = make_leaf(key, "office", robot.identity.public_key, "late", (), days=0)
+        expired = make_leaf(key, "office", robot.identity.public_key, "late", (), days=-1)
         (late.keys / "tls.pem").write_bytes(expired)
         self.keeps_out(a, b, late)
         with running(a, b, late):  # what it wrote meanwhile counts, once its certificate holds
