@@ -96,9 +96,14 @@ class Agent:
             transactions = agent._thaw(checkpoint, {id_of(data): data for data in transactions})
         for data in transactions:
             agent._through_the_door(data, again=True)
-        agent.observing.resume(agent.ledger.chain(identity.author).main)
+        agent.resume()
         agent._outbox.clear()
         return agent
+
+    def resume(self) -> None:
+        """Go on after all own transactions that the ledger holds by now. `restore` does it; after
+        it, before the first cycle, others may have known more of them."""
+        self.observing.resume(self.ledger.chain(self.identity.author).main)
 
     def checkpoint(self, stored: Sequence[TransactionId]) -> bytes:
         """The folded state. stored: ids of all accepted transactions, in the order of the store."""

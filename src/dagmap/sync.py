@@ -91,6 +91,11 @@ class Sync:
                 self._asked.pop(author, None)
             yield from self._ask(sender, peer, now)
 
+    def promised(self, author: AuthorId) -> bool:
+        """Whether a robot has announced more of an author than is here. It need not be true."""
+        heads = (peer.heads.get(author) for peer in self.peers.values())
+        return any(head is not None and self._wanted(head, {}) is not None for head in heads)
+
     def asked(self, sender: AuthorId, message: Want) -> Iterator[Post]:
         """Answer a question, up to `chunk_bytes`."""
         found: list[bytes] = []
