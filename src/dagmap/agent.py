@@ -140,11 +140,15 @@ class Agent:
         """
         return self._through_the_door(bytes(data))
 
-    def tick(self, now: float) -> list[Event]:
-        """Let time pass: release what the pacing held back, fold, announce, repair."""
+    def tick(self, now: float, unread: bool = False) -> list[Event]:
+        """Let time pass: release what the pacing held back, fold, announce, repair.
+
+        unread: whether messages have come that were not handed in yet. What is overdue may be
+        among them, so it is asked for again much later.
+        """
         events = self._issue(now)
         events += self._advance(self.config.ledger.fold_per_tick)
-        self._post(self.sync.tick(now))
+        self._post(self.sync.tick(now, unread))
         return events
 
     def outbox(self) -> list[Outgoing]:

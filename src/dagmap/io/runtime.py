@@ -166,7 +166,7 @@ class Runtime:
             events += [event for data in self._brought() for event in self.agent.take(data)]
             self._next_look = time.monotonic() + _LOOK_PERIOD
         if (before := time.monotonic()) >= self._next_tick:
-            events += self.agent.tick(self.now)
+            events += self.agent.tick(self.now, self.inbox.unread)
             after = time.monotonic()
             self._tick_took, self._next_tick = after - before, after + TICK
         elif any(isinstance(event, Accepted) for event in events):
