@@ -111,6 +111,7 @@ class Agent:
         """Take one cycle of the local SLAM. Raises CycleError, and then nothing was taken."""
         quantised = self.observing.check(quantise_cycle(cycle))
         self.observing.withdraw(quantised)  # what the SLAM removed or moved
+        self.observing.rearrange()
         self.observing.insert(quantised, now, self._settled)  # what it added: Alg. 1
         return self._issue(now)
 
@@ -139,6 +140,7 @@ class Agent:
 
     def tick(self, now: float) -> list[Event]:
         """Let time pass: release what the pacing held back, fold, announce, repair."""
+        self.observing.rearrange()
         events = self._issue(now)
         events += self._advance(self.config.ledger.fold_per_tick)
         self._post(self.sync.tick(now))
@@ -313,9 +315,10 @@ class Agent:
         if not self.consensus.pending:
             return []
         keep = None if self._pictured else self._component
+        version = self.consensus.version
         undone, applied = self.consensus.advance(budget, keep)
         self._undone, self._applied = self._undone + undone, self._applied + applied
-        if self.consensus.revising:
+        if self.consensus.version == version:
             return []
         event = MapChanged(self._undone, self._applied)
         self._undone = self._applied = 0

@@ -206,15 +206,14 @@ class Consensus:
 
     def _begin(self, work: _Work, keep: FrameId | None) -> None:
         """See whether something is to be undone; keep a picture where that will take long."""
-        before = self.picture(keep) if keep is not None else None
         changed = self._links_changed
         if changed:
             self._update_frames()
         self.revising = self._undoes or bool(self._gone)
         if not self.revising:
             self.version += changed
-        elif before is not None and before.component is not None and self._takes_long(work):
-            self._copying = Copying(before)
+        elif keep is not None and self._takes_long(work):
+            self._copying = Copying(self.folded.picture(keep))
 
     def _takes_long(self, work: _Work) -> bool:
         """Whether the budget will not suffice to undo and to apply again."""

@@ -67,10 +67,9 @@ class Issuance:
         valid = self.graph.validity(nodes) > self._config.graph.v_th
         self._ripen(nodes[valid])
 
-    def unissued_of(self, cycle: int) -> Int64s:
-        """Nodes that a cycle saw first and that are neither issued nor withdrawn, ascending."""
-        nodes = np.flatnonzero(self.cycle[: len(self.graph)] == cycle)
-        return nodes[self._open(nodes)]
+    def unissued(self) -> Int64s:
+        """Nodes that are neither issued nor withdrawn, ascending."""
+        return np.flatnonzero(self.graph.alive() & ~self.graph.issued())
 
     def see_again(self, nodes: Int64s, cycle: int) -> None:
         """Nodes that the SLAM observed once more. Only the latest such cycle is kept a node."""

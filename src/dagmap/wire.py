@@ -32,6 +32,10 @@ class Reader:
         self.at += count
         return self.data[self.at - count : self.at]
 
+    def peek(self, count: int) -> bytes:
+        """What `take` would give, or less at the end; it stays to be read."""
+        return self.data[self.at : self.at + count]
+
     def number(self, limit: int = (1 << 63) - 1) -> int:
         value = shift = 0
         while True:

@@ -64,6 +64,7 @@ class AgentCommand:
                 stack.callback(player.stop)
             with _signals(runtime, log):
                 runtime.run(player, self.until_agreed)
+            runtime.agent.settle()
             answer = report(runtime, transport)
         log.write("info", "stopped", transactions=len(runtime.agent.ledger))
         sys.stdout.write(json.dumps(answer) + "\n" if self.json else _farewell(answer))
