@@ -12,7 +12,7 @@ import numpy as np
 
 from .config import Config
 from .graph import AdjacencyDag
-from .kernels.columns import grown
+from .kernels.columns import distinct, grown
 from .model import Bools, Int32s, Int64s, Uint8s
 from .payload import Bundle, Sighting
 
@@ -133,7 +133,7 @@ class Issuance:
             return self._ripe
         per_bundle = self._config.issuance.features_per_bundle
         cores = self._ripe[self._open(self._ripe)]
-        cores = np.unique(cores)[::-1]
+        cores = distinct(cores)[::-1]
         taken, frontier, done, changed = self.graph.take(cores, per_bundle, limit)
         self._ripe = cores[done:]
         self._ripen(frontier)  # the nearest truncated inherit the core's validity (5.2)

@@ -14,7 +14,7 @@ from .config import Config
 from .graph import AdjacencyDag
 from .issuance import Issuance
 from .kernels.codec import morton_order
-from .kernels.columns import grown
+from .kernels.columns import distinct, grown
 from .kernels.geometry import apply_pose
 from .model import (
     FLEET_FRAME,
@@ -33,7 +33,7 @@ from .transaction import Transaction
 Settled: TypeAlias = Callable[[Int32s], Bools]  # of points (N, 3) mm in the SLAM frame
 CERTAIN = (1 << 31) - 1  # inliers of a link that was configured, not measured
 _ROOM = 50_000  # bytes of records in a transaction; below, what each costs at most
-_REARRANGED = 8192  # nodes that leave the DAG, or come back elsewhere, in one call
+_REARRANGED = 2048  # nodes that leave the DAG, or come back elsewhere, in one call
 _MOST_MOVED, _MOST_RETRACTED = 1024, 16_384  # that go out in one call
 _FEATURE, _PARENT, _ANCHOR, _NUMBER, _SIGHTING = 22, 6, 48, 6, 16
 NONE = np.zeros(0, np.int64)
@@ -91,12 +91,13 @@ class Observing:
             )
         fresh = cycle.session != self.session
         known = {} if fresh else self._nodes
-        for id_ in cycle.removed.tolist():
-            if id_ not in known:
-                raise CycleError(
-                    f"{where}: removed names {id_}, which this session has not seen or has "
-                    "removed before; name ids once, after their point"
-                )
+        ids = cycle.removed.tolist()
+        if not all(map(known.__contains__, ids)):
+            unknown = next(id_ for id_ in ids if id_ not in known)
+            raise CycleError(
+                f"{where}: removed names {unknown}, which this session has not seen or has "
+                "removed before; name ids once, after their point"
+            )
         cycles = {} if fresh else self._cycle_of
         for stamp, _ in cycle.moved:
             if stamp not in cycles:
@@ -115,8 +116,7 @@ class Observing:
         if cycle.session != self.session or not self._sessions:
             self._enter(cycle.session)
         if len(cycle.removed):
-            ids = cycle.removed.tolist()
-            nodes = np.sort(np.array([self._nodes.pop(id_) for id_ in ids], np.int64))
+            nodes = np.sort(np.array(list(map(self._nodes.pop, cycle.removed.tolist())), np.int64))
             self._leaving.append(nodes[nodes >= 0])  # others were thrown out of range by a move
         moved = [Anchor(self._cycle_of[s], self.session, s, pose) for s, pose in cycle.moved]
         self._moved += moved
@@ -135,16 +135,20 @@ class Observing:
             self._retracted.append(numbers[numbers >= 0])
             self.issuance.revalue(self.graph.withdraw(nodes))
             limit -= len(nodes)
-        unissued = self.issuance.unissued() if self._moving else NONE
+        unissued = self.issuance.unissued() if self._moving and limit > 0 else NONE
+        batch: list[tuple[Int64s, Int32s]] = []
         done = 0
         while done < len(self._moving) and limit > 0:
-            anchor, done = self._moving[done], done + 1
+            anchor = self._moving[done]
+            if any(anchor.cycle == moved.cycle for moved in self._moving[:done]):
+                break  # moved again: the nodes have to be there first
+            done += 1
             mine = self.issuance.cycle[unissued] == anchor.cycle
             if mine.any():
-                came = self._reinsert(unissued[mine], anchor.pose)
-                unissued = np.concatenate([unissued[~mine], came])
+                batch.append((unissued[mine], anchor.pose))
                 limit -= int(mine.sum())
         del self._moving[:done]
+        self._reinsert(batch)
 
     def insert(self, cycle: QuantisedCycle, now: float, settled: Settled) -> None:
         """Algorithm 1 for every new feature of the cycle, in the order of a Z curve.
@@ -205,7 +209,7 @@ class Observing:
         sightings = [] if batch is None else list(batch.sightings)
         anchors, self._anchors, self._anchors_since = self._anchors, [], None
         anchors, self._moved = anchors + self._moved[:_MOST_MOVED], self._moved[_MOST_MOVED:]
-        retracted = np.unique(np.concatenate([NONE, *self._retracted]))
+        retracted = distinct(np.concatenate([NONE, *self._retracted]))
         self._retracted = [retracted[_MOST_RETRACTED:]] if len(retracted) > _MOST_RETRACTED else []
         retracted = retracted[:_MOST_RETRACTED]
         links, self._links = tuple(self._links), []
@@ -273,32 +277,34 @@ class Observing:
             self.issuance.see_again(np.array(again, np.int64), cycle)
         return np.array(new, np.int64)
 
-    def _reinsert(self, old: Int64s, pose: Int32s) -> Int64s:
-        """Nodes of a cycle that a loop closure moved come back where they are now.
+    def _reinsert(self, batch: list[tuple[Int64s, Int32s]]) -> None:
+        """Unissued nodes of cycles that a loop closure moved come back where they are now."""
+        if not batch:
+            return
+        leaving = np.sort(np.concatenate([old for old, _ in batch]))
+        self.issuance.revalue(self.graph.withdraw(leaving))
+        for old, pose in batch:
+            columns = self.issuance
+            positions, inside = _carry(pose, columns.place[old])
+            nodes, kept = self.graph.insert(positions[inside]), old[inside]
+            columns.add(
+                nodes,
+                columns.cycle[kept],
+                columns.place[kept],
+                columns.color[kept],
+                columns.colored[kept],
+            )
+            self._rename(old, kept, nodes)
 
-        Returns the new nodes. Those issued stay: their anchor is published anew, not they.
-        """
-        self.issuance.revalue(self.graph.withdraw(old))
-        positions, inside = _carry(pose, self.issuance.place[old])
-        nodes = self.graph.insert(positions[inside])
-        kept = old[inside]
-        columns = self.issuance
-        columns.add(
-            nodes,
-            columns.cycle[kept],
-            columns.place[kept],
-            columns.color[kept],
-            columns.colored[kept],
-        )
+    def _rename(self, old: Int64s, kept: Int64s, nodes: Int64s) -> None:
+        """The ids of old nodes name new ones; of those that were not kept, none."""
         names = self._names(old)
-        for id_ in names.values():
-            self._nodes[id_] = -1
+        self._nodes.update(dict.fromkeys(names.values(), -1))
         self._id_of = grown(self._id_of, len(self.graph), 0)
         for before, after in zip(kept.tolist(), nodes.tolist(), strict=True):
             if before in names:
                 self._nodes[names[before]] = after
                 self._id_of[after] = names[before]
-        return nodes
 
     def _names(self, nodes: Int64s) -> dict[int, int]:
         """The id that the SLAM gave, of those of these nodes that have one."""

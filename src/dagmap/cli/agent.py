@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import signal
 import sys
@@ -62,6 +63,8 @@ class AgentCommand:
             if player is not None:
                 player.start()
                 stack.callback(player.stop)
+            gc.collect()
+            gc.freeze()  # what is loaded by now stays: to look at it again would cost a pause
             with _signals(runtime, log):
                 runtime.run(player, self.until_agreed)
             runtime.agent.settle()
