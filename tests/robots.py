@@ -248,7 +248,8 @@ def running(*robots: Robot) -> Iterator[None]:
 def agreed(*robots: Robot, authors: int = 0) -> list[dict[str, Any]]:
     """The statuses, where all are done and hold one map of so many authors; else []."""
     answers = [robot.status() for robot in robots]
-    if not all(answers) or len({answer["digest"] for answer in answers}) > 1:
+    digests = {answer["digest"] for answer in answers if answer}
+    if not all(answers) or len(digests) > 1 or None in digests:
         return []
     for answer in answers:
         busy = answer["lag"]["to_issue"] or answer["lag"]["missing"]
