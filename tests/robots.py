@@ -181,6 +181,11 @@ class Robot:
         assert self.code() is None, self.log
         return {}
 
+    def answer(self) -> dict[str, Any]:
+        """The status, however long a slow machine takes for it."""
+        status: dict[str, Any] = until(self.status, f"{self.name} to answer")
+        return status
+
     def signal(self, number: int) -> None:
         assert self.pid is not None
         with suppress(ProcessLookupError):
