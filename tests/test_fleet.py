@@ -134,15 +134,17 @@ class TestAgreement:
     ) -> None:
         a = Robot(nursery, tmp_path, "a", record_much(tmp_path / "long.npz"))
         b = Robot(nursery, tmp_path, "b")
+        c = Robot(nursery, tmp_path, "c", connect=(a.port,))
         proxy = Proxy(b.port)
         a.connect = (proxy.port,)
         a.more = f"send_bytes = {1 << 16}"
-        with running(a, b):
+        with running(a, b, c):
             b.start()
-            until(b.status, "b")
-            a.start("--speed", 10, "--wait-for", 1)  # slow enough to be seen beginning
-            until(lambda: a.status().get("cycles", 0) >= 2, "a to begin")
+            who = until(b.status, "b")["author"]
+            a.start("--speed", 50, "--wait-for", 2)
+            until(lambda: a.answer()["peers"].get(who, {}).get("here"), "a to reach b")
             proxy.flowing.clear()
+            c.start()  # which a has waited for
             stalled = until(lambda: a.answer()["cycles"] == 60 and a.answer(), "a to end")
             assert stalled["lag"]["unsent_bytes"] > 0 or stalled["traffic"]["dropped"]["sent"] > 0
             assert b.answer()["transactions"] < stalled["transactions"]
