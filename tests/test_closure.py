@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import random
 from dataclasses import replace
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -33,8 +34,9 @@ from test_promise import from_scratch
 NOTHING = np.zeros((0, 3))
 
 
-def bounded(units: int, config: Config = QUICK) -> Config:
-    return msgspec.structs.replace(config, ledger=LedgerConfig(fold_per_tick=units))
+def bounded(units: int, config: Config = QUICK, undo_kept: int = 1_000_000) -> Config:
+    ledger = LedgerConfig(fold_per_tick=units, undo_kept=undo_kept)
+    return msgspec.structs.replace(config, ledger=ledger)
 
 
 def walked(config: Config, name: str = "a", count: int = 12) -> Agent:
@@ -225,14 +227,57 @@ class TestLateOnes:
         assert bricks[0] == bricks[1] > 0
 
 
-@given(rng=st.randoms(use_true_random=False), units=st.sampled_from([40, 150, 700]))
+class TestDroppedRecords:
+    """Undo records behind a checkpoint."""
+
+    @pytest.mark.parametrize("preset", ["default", "paper"])
+    def test_free_memory_and_what_comes_from_before_them_is_folded_from_the_first_on(
+        self, preset: Literal["default", "paper"]
+    ) -> None:
+        fold = msgspec.structs.replace(QUICK.fold, preset=preset)
+        config = msgspec.structs.replace(bounded(300, undo_kept=100), fold=fold)
+        robot = walked(config)
+        held, before = robot.consensus.nbytes, robot.map
+        observations = sum(c.size for c in robot.consensus.contributions())
+        robot.checkpoint([tx.id for tx in robot.ledger])
+        freed = held - robot.consensus.nbytes
+        assert freed >= 4 * (observations - 200) > 0  # the transaction that reaches 100 is whole
+        robot.observe(closing(12), 1000.0)
+        while not robot.settled:
+            robot.tick(1001.0)
+            assert robot.settled or robot.map is before
+        assert robot.map is not before and robot.digest() == afresh(robot).digest()
+
+    def test_leave_enough_for_what_comes_a_little_late(self) -> None:
+        author, late, consensus = Author("a"), Author("b"), Consensus(bounded(300, CONFIG, 40))
+        for i in range(30):
+            consensus.add(author.make(lamport=1000 + i))
+        consensus.advance()
+        consensus.drop_records()
+        firm = consensus.folded.firm
+        assert 0 < firm < 30
+        consensus.add(late.make(lamport=1028))
+        assert consensus.advance() == (2, 3)
+        consensus.add(late.make(lamport=1029))
+        consensus.drop_records()
+        consensus.add(late.make(lamport=1031))
+        assert consensus.advance() == (1, 3)
+        consensus.add(Author("c").make(lamport=1))
+        assert consensus.advance() == (33, 34)  # which is all of them
+
+
+@given(
+    rng=st.randoms(use_true_random=False),
+    units=st.sampled_from([40, 150, 700]),
+    undo_kept=st.sampled_from([0, 50, 1_000_000]),
+)
 @settings(max_examples=25, deadline=None)
 def test_moved_removed_and_late_in_any_mixture_end_as_the_fold_from_scratch(
-    rng: random.Random, units: int
+    rng: random.Random, units: int, undo_kept: int
 ) -> None:
     """Two robots walk, remove and close loops; a listener gets it in any order and small steps,
-    is read now and then, and in a revision serves the map of what it held before."""
-    config, said = bounded(units), []
+    is read now and then, drops undo records, and in a revision serves the map of before."""
+    config, said = bounded(units, undo_kept=undo_kept), []
     for seed in (1, 2):
         robot = agent(f"r{seed}", config)
         for cycle in cycles(seed, rng.randint(3, 8)):
@@ -247,6 +292,8 @@ def test_moved_removed_and_late_in_any_mixture_end_as_the_fold_from_scratch(
             before, version = afresh(listener).map, listener.consensus.version
             if rng.random() < 0.5:
                 assert same(listener.map, before)
+            if rng.random() < 0.3:
+                listener.consensus.drop_records()
         handful, said = said[:6], said[6:]
         listener.receive(encode(Transactions(tuple(handful)), config, b"somebody"), 0.0)
         listener.tick(1.0)

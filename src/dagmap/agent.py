@@ -108,8 +108,12 @@ class Agent:
         self.observing.resume(self.ledger.chain(self.identity.author).main)
 
     def checkpoint(self, stored: Sequence[TransactionId]) -> bytes:
-        """The folded state. stored: ids of all accepted transactions, in the order of the store."""
+        """The folded state. stored: ids of all accepted transactions, in the order of the store.
+
+        Undo records that lie far behind it are dropped (`ledger.undo_kept`).
+        """
         self.settle()
+        self.consensus.drop_records()
         return checkpoints.save(self.ledger, self.consensus, self.identity, stored)
 
     def observe(self, cycle: Cycle, now: float) -> list[Event]:

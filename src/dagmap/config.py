@@ -142,11 +142,15 @@ class LedgerConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     waiting_transactions: int = 4096  # the waiting room: transactions without their references
     waiting_bytes: int = 64 << 20
+    # Observations whose folding can be undone after a checkpoint, at 4 bytes each. What comes from
+    # before them costs a fold of everything, half of which it would cost anyway.
+    undo_kept: int = 1_000_000
     fold_per_tick: int = 25_000  # work of a tick, in features folded; a unit is about 1 us
 
     def __post_init__(self) -> None:
         self._require_range("waiting_transactions", 1, 1 << 24)
         self._require_range("waiting_bytes", 1 << 16, 1 << 40)
+        self._require_range("undo_kept", 0, 1 << 40)
         self._require_range("fold_per_tick", 1, 1 << 40)
 
 

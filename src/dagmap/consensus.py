@@ -126,6 +126,12 @@ class Consensus:
                     break
         return work.undone, work.applied
 
+    def drop_records(self) -> None:
+        """Drop the undo records of all but the newest; what comes before them later is folded
+        anew from the first transaction on."""
+        if not self.revising:
+            self.folded.drop_records(self._config.ledger.undo_kept)
+
     def picture(self, origin: FrameId) -> Picture:
         """A component as it is folded; in a revision what was to be kept, as it was before it."""
         if self._kept is not None:
@@ -220,7 +226,7 @@ class Consensus:
         folded = self.folded
         left, at = work.left - sum(map(folded.walk_units, self._gone)), len(folded.applied)
         while at > 0 and self._mark is not None and folded.applied[at - 1].key >= self._mark:
-            at -= 1
+            at = 0 if at == folded.firm else at - 1
             left -= folded.undo_units(folded.applied[at])
             if left <= 0:
                 return True
@@ -242,8 +248,9 @@ class Consensus:
         if self._links_changed:
             self._update_frames()
         while self._undoes and not work.over:
-            work.left -= self.folded.undo_units(self.folded.undo())
-            work.undone += 1
+            before = len(self.folded.applied)
+            work.left -= self.folded.undo()
+            work.undone += before - len(self.folded.applied)
         while self._gone and not self._undoes and not work.over:
             work.left -= self.folded.walk_units(self._gone[-1])
             self.folded.walk(self._gone.pop(), -1)

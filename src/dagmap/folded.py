@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import hashlib
 import pickle
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,18 +96,43 @@ class Folded:
         self._ray_units = 1 + config.max_ray_mm // config.cell_mm // _RAY_CELLS
         self.components: dict[FrameId, Component] = {}
         self.applied: list[Contribution] = []
+        self.firm = 0  # of these, the first so many have no undo records any more
 
     def apply(self, contribution: Contribution) -> None:
         for part in contribution.parts:
             self._changed(part.component).fold.apply(contribution.block(part))
         self.applied.append(contribution)
 
-    def undo(self) -> Contribution:
-        """Take back the contribution that was applied last."""
+    def undo(self) -> int:
+        """Take back the contribution that was applied last; where its record is dropped, all of
+        them, to be applied from the first on. Returns the work."""
+        if self.firm == len(self.applied):
+            return self._start_over()
         contribution = self.applied.pop()
         for part in reversed(contribution.parts):
             self._changed(part.component).fold.undo(contribution.block(part))
-        return contribution
+        return self.undo_units(contribution)
+
+    def drop_records(self, keep: int) -> None:
+        """Drop the undo records of all but the last contributions with `keep` observations."""
+        kept, size = Counter[FrameId](), 0
+        first = len(self.applied)
+        while first > self.firm and size < keep:
+            first -= 1
+            size += self.applied[first].size
+            for part in self.applied[first].parts:
+                sightings = sum(len(sighting.numbers) for sighting in part.sightings)
+                kept[part.component] += 1 + len(self.applied[first].xyz) + sightings
+        self.firm = first
+        for id_, component in self.components.items():
+            component.fold.drop_records(kept[id_])
+
+    def _start_over(self) -> int:
+        self.firm = 0
+        self.applied.clear()
+        for id_ in self.components:
+            self._changed(id_).fold = make_fold(self._config, self._salt)
+        return TRANSACTION
 
     def walk(self, contribution: Contribution, sign: int) -> None:
         """Add a contribution's rays (+1) or take them back (-1), as it was last placed."""
