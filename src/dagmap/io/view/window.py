@@ -90,7 +90,7 @@ class Window(Closing):
         self._host, self._source = host, source
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
         self._server.gui.set_panel_label("DAGmap")
-        self._controls = Controls(self._server.gui, points)
+        self.controls = Controls(self._server.gui, points)
         self._stopped = threading.Event()
         self._lock = threading.Lock()
         self._eyes: dict[int, _Eye] = {}
@@ -164,15 +164,15 @@ class Window(Closing):
             return
         latest = self._working(self._source.latest)
         self._next_news = time.monotonic() + max(_NEWS, 3 * (time.monotonic() - now))
-        self._controls.offer(self._source.count)
+        self.controls.offer(self._source.count)
         standings, remark = self._source.standings(), self._source.remark()
         if self._changed("standing", latest, tuple(standings), remark):
-            self._controls.standing.content = words.standing(
+            self.controls.standing.content = words.standing(
                 self._source.title, standings, latest.digest, remark
             )
         if latest is not self._latest:
             self._latest = latest
-            if self._controls.latest.value:
+            if self.controls.latest.value:
                 self._show(latest)
 
     def _walk(self) -> None:
@@ -180,8 +180,8 @@ class Window(Closing):
         count, now = self._source.count, time.monotonic()
         if now >= self._next_play:
             self._next_play = now + _PLAY
-            self._controls.step(count)
-        wanted = self._controls.wanted_count(count)
+            self.controls.step(count)
+        wanted = self.controls.wanted_count(count)
         if not self._changed("count", wanted, count) or self._latest is None:
             return
         if wanted == count:
@@ -191,7 +191,7 @@ class Window(Closing):
 
     def _working(self, work: Callable[[Callable[[float], None]], T]) -> T:
         """Do it, and show how far it is where it takes long."""
-        bar, begun = self._controls.busy, time.monotonic()
+        bar, begun = self.controls.busy, time.monotonic()
 
         def say(share: float) -> None:
             if time.monotonic() - begun > 0.3:
@@ -224,7 +224,7 @@ class Window(Closing):
     # Drawing. Each part is drawn again where what it depends on has changed.
 
     def _draw(self, snapshot: Snapshot) -> None:
-        controls = self._controls
+        controls = self.controls
         if self._changed("picture", snapshot, controls.wanted_states, self._names):
             self._picture = Picture(snapshot, controls.wanted_states, self._names)
         picture = self._picture
@@ -237,7 +237,7 @@ class Window(Closing):
         self._draw_newest(snapshot)
 
     def _draw_base(self, picture: Picture) -> None:
-        controls = self._controls
+        controls = self.controls
         colouring, size = controls.colouring.value, controls.size.value
         budget = min(_MOVING, 1000 * int(controls.points.value))
         if not self._changed("base", picture, colouring, size, budget):
@@ -255,7 +255,7 @@ class Window(Closing):
 
     @property
     def _budget(self) -> int:
-        return 1000 * int(self._controls.points.value)
+        return 1000 * int(self.controls.points.value)
 
     def _draw_details(self, picture: Picture) -> None:
         """What a browser shows about the place it looks at, once its camera rests."""
@@ -267,7 +267,7 @@ class Window(Closing):
             camera = eye.client.camera
             centre = np.asarray(camera.look_at, np.float64)
             radius = 1.3 * float(np.linalg.norm(np.asarray(camera.position) - centre))
-            colouring, size = self._controls.colouring.value, self._controls.size.value
+            colouring, size = self.controls.colouring.value, self.controls.size.value
             if eye.drawn.changed(picture, colouring, size, self._budget, centre, radius):
                 self._looked_at = centre
                 rows = picture.near(centre, radius, max(0, self._budget - _MOVING))
@@ -282,7 +282,7 @@ class Window(Closing):
                 eye.detail.visible = True
 
     def _draw_paths(self, snapshot: Snapshot) -> None:
-        wanted = self._controls.paths.value
+        wanted = self.controls.paths.value
         if not self._changed("paths", snapshot, wanted, self._names):
             return
         scene, size = self._server.scene, self._stand.size if self._stand else 1.0
@@ -312,20 +312,20 @@ class Window(Closing):
         scene, world = self._server.scene, snapshot.world
         scene.remove_by_name("/picked")
         if self._picked is None or not len(world.positions):
-            self._controls.node.content = words.plain("click on a point")
+            self.controls.node.content = words.plain("click on a point")
             return
         node = int(np.argmin(np.linalg.norm(world.positions - self._picked, axis=1)))
         place = world.positions[node]
-        radius = 0.0015 * self._controls.size.value
+        radius = 0.0015 * self.controls.size.value
         scene.add_icosphere("/picked", radius, _MARK, position=tuple(place))
         if isinstance(world, WorldMap):
             fold = self._source.config.fold
-            self._controls.node.content = words.node(world, node, snapshot.said, fold)
+            self.controls.node.content = words.node(world, node, snapshot.said, fold)
         else:
-            self._controls.node.content = words.plain("the ledger is still being read")
+            self.controls.node.content = words.plain("the ledger is still being read")
 
     def _draw_edges(self, snapshot: Snapshot) -> None:
-        controls = self._controls
+        controls = self.controls
         wanted, radius = controls.edges.value, float(controls.radius.value)
         centre = self._looked_at if self._picked is None else self._picked
         if not self._changed("edges", snapshot, wanted, radius, centre if wanted else None):
@@ -352,11 +352,11 @@ class Window(Closing):
         if not self._changed("newest", snapshot):
             return
         count = len(snapshot.said)
-        self._controls.newest.content = words.newest(snapshot.said, count)
+        self.controls.newest.content = words.newest(snapshot.said, count)
         moves = self._source.live or snapshot is not self._latest
         points = newest_features(snapshot.said, 1 if moves else 0)
         colors = np.broadcast_to(np.array(_NEWEST, np.uint8), points.shape)
-        size = 1.8 * float(self._controls.size.value)
+        size = 1.8 * float(self.controls.size.value)
         self._cloud(self._server.scene, "/newest", points, colors, size)
 
     def _cloud(
