@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-from urllib.request import urlopen
+from urllib.request import ProxyHandler, build_opener
 
 import pytest
 from websockets.sync.client import ClientConnection, connect
@@ -55,6 +55,7 @@ class Browser:
 
     def __init__(self, connection: ClientConnection) -> None:
         self._connection, self._number = connection, 0
+        self._events: set[str] = set()  # that came while something else was waited for
 
     def call(self, method: str, **params: Any) -> dict[str, Any]:
         """One command of the DevTools protocol and its result."""
@@ -62,11 +63,15 @@ class Browser:
         message = {"id": self._number, "method": method, "params": params}
         self._connection.send(json.dumps(message))
         deadline = time.monotonic() + PATIENCE
-        while True:
-            answer = json.loads(self._connection.recv(deadline - time.monotonic()))
-            if answer.get("id") == self._number:
-                assert "error" not in answer, (method, answer["error"])
-                return answer["result"]  # type: ignore[no-any-return]
+        while (answer := self._next(deadline)).get("id") != self._number:
+            pass
+        assert "error" not in answer, (method, answer["error"])
+        return answer["result"]  # type: ignore[no-any-return]
+
+    def _next(self, deadline: float) -> dict[str, Any]:
+        message = json.loads(self._connection.recv(deadline - time.monotonic()))
+        self._events.add(message.get("method", ""))
+        return message  # type: ignore[no-any-return]
 
     def run(self, script: str) -> Any:
         """What a JavaScript expression gives; a promise is waited for."""
@@ -77,8 +82,13 @@ class Browser:
         return result["result"].get("value")
 
     def go(self, url: str) -> None:
+        """Load a page, and wait until it is there."""
         self.call("Page.enable")
+        self._events.clear()
         self.call("Page.navigate", url=url)
+        deadline = time.monotonic() + PATIENCE
+        while "Page.loadEventFired" not in self._events:
+            self._next(deadline)
 
     def click(self, x: float, y: float) -> None:
         for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
@@ -116,7 +126,7 @@ def open_browser(width: int = 1000, height: int = 700) -> Iterator[Browser]:
         )  # fmt: skip
         try:
             port = _port(Path(profile), process)
-            with connect(_page(port), max_size=None, compression=None) as connection:
+            with connect(_page(port), max_size=None, compression=None, proxy=None) as connection:
                 yield Browser(connection)
         finally:
             os.killpg(process.pid, signal.SIGKILL)
@@ -137,7 +147,8 @@ def _port(profile: Path, process: subprocess.Popen[bytes]) -> int:
 
 def _page(port: int) -> str:
     def look() -> str | None:
-        with urlopen(f"http://127.0.0.1:{port}/json/list", timeout=PATIENCE) as answer:
+        opener = build_opener(ProxyHandler({}))  # this machine is reached without one
+        with opener.open(f"http://127.0.0.1:{port}/json/list", timeout=PATIENCE) as answer:
             pages = [page for page in json.load(answer) if page["type"] == "page"]
         return pages[0]["webSocketDebuggerUrl"] if pages else None
 
