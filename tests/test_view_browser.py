@@ -21,6 +21,7 @@ from dagmap.model import State
 from runs import NAMES, replay_of
 
 LEFT = 0.6  # of the width: the panel covers the rest
+TOP = 160  # pixels that a notice may cover: that the browser draws in software
 ENOUGH = 100  # pixels of one colour
 
 
@@ -49,10 +50,10 @@ def pixels(browser: Browser, color: str) -> np.ndarray:
     from matplotlib.image import imread
 
     picture = np.asarray(imread(io.BytesIO(browser.screenshot())))[..., :3] * 255
-    picture = picture[:, : int(LEFT * picture.shape[1])]
+    picture = picture[TOP:, : int(LEFT * picture.shape[1])]
     wanted = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)])
     rows, columns = np.nonzero((np.abs(picture - wanted) < 30).all(axis=-1))
-    return np.column_stack([columns, rows])
+    return np.column_stack([columns, rows + TOP])
 
 
 def test_the_points_are_on_the_screen(run: Path) -> None:
