@@ -1,6 +1,6 @@
 """`dagmap view`: from the command to a map of 10^6 points on the screen, and frames a second.
 
-The map is made here: a building of 40 x 20 m in which two robots have seen every point once. The
+The map is made here: a building of 60 x 30 m that one robot has walked through. The
 browser is the one that the tests use, which draws in software: a graphics card only does better.
 Each figure is taken while the camera turns, over ten seconds.
 """
@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 BY_NAME_ONLY = True
 POINTS, OF_A_CYCLE, SECONDS = 1_000_000, 1000, 10.0
-SIZE = (40.0, 20.0, 3.0)  # m
+SIZE = (60.0, 30.0, 3.0)  # m
 _COUNT = """(() => { window.drawn = [0, performance.now()];
   const old = WebGL2RenderingContext.prototype.drawArrays;
   WebGL2RenderingContext.prototype.drawArrays = function (...a) { window.inFrame = true;
@@ -84,7 +84,7 @@ def building(rng: np.random.Generator) -> np.ndarray:
     points[kind == 1, 2] = SIZE[2]
     points[kind == 2, 0] = np.round(points[kind == 2, 0] / 4.0) * 4.0
     points[kind == 3, 1] = np.round(points[kind == 3, 1] / 4.0) * 4.0
-    points = points[: int(1.15 * POINTS)]
+    points = points[: int(1.2 * POINTS)]
     return points[np.lexsort((points[:, 1], np.floor(points[:, 0] / 0.5)))]
 
 

@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     import viser
 
 POINTS = 400_000  # drawn of a map at most, unless somebody asks for more
-_MOVING = 40_000  # points all over the map: what a browser without a graphics card can turn
+_MOVING = 30_000  # points all over the map: what a browser without a graphics card can turn
+_RESTING = 100_000  # that it can draw when nothing moves, about the place it looks at
 _EDGES = 20_000
 _TICK = 0.05  # s between two looks at what is wanted
 _REST = 0.3  # s without a movement of the camera, after which its surroundings are drawn
@@ -196,6 +197,8 @@ class Window(Closing):
         def say(share: float) -> None:
             if time.monotonic() - begun > 0.3:
                 bar.visible, bar.value = True, 100 * min(max(share, 0.0), 1.0)
+            if self._shown is not None:
+                self._draw(self._shown)  # meanwhile the view goes on
 
         try:
             return work(say)
@@ -268,9 +271,11 @@ class Window(Closing):
             centre = np.asarray(camera.look_at, np.float64)
             radius = 1.3 * float(np.linalg.norm(np.asarray(camera.position) - centre))
             colouring, size = self.controls.colouring.value, self.controls.size.value
-            if eye.drawn.changed(picture, colouring, size, self._budget, centre, radius):
+            budget = max(0, self._budget - _MOVING)
+            budget = min(budget, _RESTING) if eye.pace.slow else budget
+            if eye.drawn.changed(picture, colouring, size, budget, centre, radius):
                 self._looked_at = centre
-                rows = picture.near(centre, radius, max(0, self._budget - _MOVING))
+                rows = picture.near(centre, radius, budget)
                 eye.detail = self._cloud(
                     eye.client.scene,
                     "/detail",

@@ -97,7 +97,8 @@ def node(world: WorldMap, number: int, said: Iterable[Said], fold: FoldConfig) -
             (
                 escape(robot),
                 f"{len(observations)}x",
-                _seconds(first.stamp) + ("" if last is first else f" to {_seconds(last.stamp)}"),
+                _seconds(first.stamp)
+                + (f" to {_seconds(last.stamp)}" if last.stamp > first.stamp else ""),
                 named + more,
             )
         )
