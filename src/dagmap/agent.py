@@ -96,9 +96,14 @@ class Agent:
             transactions = agent._thaw(checkpoint, {id_of(data): data for data in transactions})
         for data in transactions:
             agent._through_the_door(data, again=True)
-        agent.observing.resume(agent.ledger.chain(identity.author).main)
+        agent.resume()
         agent._outbox.clear()
         return agent
+
+    def resume(self) -> None:
+        """Go on after all own transactions that the ledger holds by now. `restore` does it; after
+        it, before the first cycle, others may have known more of them."""
+        self.observing.resume(self.ledger.chain(self.identity.author).main)
 
     def checkpoint(self, stored: Sequence[TransactionId]) -> bytes:
         """The folded state. stored: ids of all accepted transactions, in the order of the store."""
@@ -135,11 +140,15 @@ class Agent:
         """
         return self._through_the_door(bytes(data))
 
-    def tick(self, now: float) -> list[Event]:
-        """Let time pass: release what the pacing held back, fold, announce, repair."""
+    def tick(self, now: float, unread: bool = False) -> list[Event]:
+        """Let time pass: release what the pacing held back, fold, announce, repair.
+
+        unread: whether messages have come that were not handed in yet. What is overdue may be
+        among them, so it is asked for again much later.
+        """
         events = self._issue(now)
         events += self._advance(self.config.ledger.fold_per_tick)
-        self._post(self.sync.tick(now))
+        self._post(self.sync.tick(now, unread))
         return events
 
     def outbox(self) -> list[Outgoing]:
