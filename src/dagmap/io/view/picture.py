@@ -13,6 +13,8 @@ from .picking import pick
 from .snapshot import Snapshot
 from .thinning import Thinning
 
+_ENOUGH = 20_000  # points that tell how a map lies
+
 
 class Picture:
     """The nodes of a snapshot in the states that a person wants to see.
@@ -62,6 +64,7 @@ class Stand:
         points = np.asarray(snapshot.world.positions, np.float64)
         kept = points[np.asarray(snapshot.world.states) != State.REJECTED]
         points = kept if len(kept) else points
+        points = points[:: max(1, len(points) // _ENOUGH)]
         poses = np.concatenate([np.zeros((0, 4, 4)), *(path.poses for path in snapshot.paths)])
         self.blind = not len(poses)  # up was guessed from the points alone
         axes = choose_view(points, poses).axes

@@ -20,7 +20,8 @@ from .history import History, Progress
 from .snapshot import Snapshot, take
 from .source import Standing
 
-_STEP = 256  # transactions between two words on the progress
+_STEP = 64  # transactions that are read between two words on the progress
+_FEATURES = 50_000  # that are folded between two
 
 
 class _Robot(msgspec.Struct, frozen=True):
@@ -74,6 +75,10 @@ class Run:
                 self._refused += any(isinstance(event, Rejected) for event in events)
                 if i % _STEP == 0:
                     progress(0.5 * i / len(self._transactions))
+            folded = 0
+            while agent.consensus.pending:
+                folded += agent.consensus.advance(_FEATURES)[1]
+                progress(0.5 + 0.5 * folded / len(self._transactions))
             self._latest = take(agent)
             counted = agent.consensus.contributions()
             self._history.follow([each.transaction.data for each in counted])
