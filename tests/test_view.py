@@ -275,6 +275,12 @@ class TestPace:
                 pace.moved(100.0 * chance + 10 + 0.5 * i)
             assert pace.slow
 
+    def test_a_slow_frame_is_no_rest(self) -> None:
+        pace = Pace()
+        for i in range(3):
+            pace.moved(1.0 * i)
+        assert not pace.rests(4.9, 0.3) and pace.rests(5.0, 0.3)
+
     def test_pauses_are_no_slowness(self) -> None:
         pace = Pace()
         assert pace.rests(0.0, 1.0)

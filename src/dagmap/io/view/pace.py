@@ -19,6 +19,7 @@ class Pace:
     def __init__(self) -> None:
         self.slow = True
         self._last: float | None = None
+        self._gap = 0.0  # s between its last two frames
         self._slow_frames = self._fast_frames = self._proofs = 0
 
     def moved(self, now: float) -> None:
@@ -27,6 +28,7 @@ class Pace:
         self._last = now
         if gap >= _PAUSE:
             return
+        self._gap = gap
         self._slow_frames = self._slow_frames + 1 if gap > SLOW else 0
         self._fast_frames = self._fast_frames + 1 if gap < _FAST else 0
         if self.slow and self._fast_frames >= _PROOF and self._proofs < _CHANCES:
@@ -36,5 +38,5 @@ class Pace:
             self.slow = True
 
     def rests(self, now: float, seconds: float) -> bool:
-        """Whether there was no movement for so long."""
-        return self._last is None or now - self._last >= seconds
+        """Whether there was no movement for so long; of a slow browser, for three frames too."""
+        return self._last is None or now - self._last >= max(seconds, 3 * self._gap)
