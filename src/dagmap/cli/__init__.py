@@ -103,6 +103,34 @@ def status(
 
 
 @app.command()
+def view(
+    folder: Annotated[
+        Path | None, typer.Argument(help="The --out of a replay.", show_default=False)
+    ] = None,
+    live: Annotated[
+        str | None, typer.Option(help="Endpoint of a running fleet, as tcp/192.168.1.7:7447.")
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(help="With --live: TOML file with the fleet's name and parameters."),
+    ] = None,
+    robot: Annotated[
+        str | None, typer.Option(help="Whose ledger of a run is shown; default: the first one's.")
+    ] = None,
+    host: Annotated[
+        str, typer.Option(help="Address to serve at; 0.0.0.0 lets others look on.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port to serve at; 0: any that is free.")] = 8080,
+    points: Annotated[int, typer.Option(help="Points that are drawn at most.")] = 400_000,
+    browser: Annotated[bool, typer.Option(help="Open a browser.")] = True,
+) -> None:
+    """Look at a run or at a running fleet in a browser: the map, the robots, the ledger."""
+    from .view import ViewCommand
+
+    ViewCommand(folder, live, config, robot, host, port, points, browser).run()
+
+
+@app.command()
 def evaluate(
     map: Annotated[Path, typer.Argument(help="The map: PLY or NPZ.")],  # noqa: A002
     reference: Annotated[Path, typer.Option(help="What is true: PLY or NPZ, in the same frame.")],
