@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -64,10 +65,15 @@ def test_the_points_are_on_the_screen(run: Path) -> None:
         wait_for(lambda: len(pixels(browser, amber)) > ENOUGH, "points in the state's colour")
         wait_for(lambda: "all 2 robots agree" in controls.standing.content, "the sign of agreement")
         assert "all 2 robots agree" in browser.run("document.body.innerText")
+
         # A point that is clicked tells its story.
-        x, y = pixels(browser, amber)[ENOUGH // 2].tolist()
-        browser.click(x, y)
-        wait_for(lambda: "kept" in controls.node.content, "the story of the point")
+        def told() -> bool:
+            x, y = pixels(browser, amber)[ENOUGH // 2].tolist()
+            browser.click(x, y)
+            time.sleep(0.5)
+            return "kept" in controls.node.content
+
+        wait_for(told, "the story of the point")
         assert any(name in controls.node.content for name in NAMES)
         # By robot: other colours, the old one is gone.
         controls.paths.value = False

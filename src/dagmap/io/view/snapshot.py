@@ -64,7 +64,7 @@ def take(agent: Agent) -> Snapshot:
     origin = _largest(agent)
     world = agent.map
     if world.origin != origin:
-        world = build_map(agent.consensus, origin, agent.config.fold.cell)
+        world = build_map(agent.consensus.picture(origin), agent.config.fold.cell)
     said = [
         Said(name_of(c.author), c.transaction, c.base, c.xyz, _stamp(c.author, c.cycles))
         for c in agent.consensus.contributions()
