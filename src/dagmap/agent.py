@@ -41,6 +41,7 @@ from .model import (
     quantise_cycle,
 )
 from .observing import Observing
+from .placing import Placing
 from .sync import Post, Sync
 from .transaction import Transaction, glance, id_of, parse, seal
 from .wire import Refusal
@@ -73,6 +74,7 @@ class Agent:
         self.consensus = Consensus(self.config, identity.salt)
         self.observing = Observing(self.config, identity.author, identity.salt)
         self.sync = Sync(self.ledger, self.config, identity.author)
+        self.placing = Placing(self.config.placing, identity.author)
         self._outbox: list[Outgoing] = []
         self._map: WorldMap | None = None
 
@@ -136,9 +138,10 @@ class Agent:
         return self._through_the_door(bytes(data))
 
     def tick(self, now: float) -> list[Event]:
-        """Let time pass: release what the pacing held back, fold, announce, repair."""
+        """Let time pass: release what the pacing held back, fold, place, announce, repair."""
         events = self._issue(now)
         events += self._advance(self.config.ledger.fold_per_tick)
+        self.observing.relate(*self.placing.step(self.ledger, self.consensus))
         self._post(self.sync.tick(now))
         return events
 
@@ -191,6 +194,12 @@ class Agent:
                     name = author.name if author.name not in found else None  # names are free
                     found[name or author.id.hex()] = (place, anchor.stamp / 1e6)
         return found
+
+    @property
+    def unplaced(self) -> dict[FrameId, str]:
+        """SLAM frames that no links lead to from this robot's, and why: they wait, unmerged."""
+        self._advance()
+        return self.placing.why(self.consensus)
 
     @property
     def _component(self) -> FrameId:

@@ -62,6 +62,7 @@ class Replay:
     seed: int
     max_features: int
     camera: Path | None
+    unknown_frames: bool
     force: bool
     json: bool
     console: Console = field(default_factory=lambda: Console(stderr=True))
@@ -74,6 +75,8 @@ class Replay:
             raise DagmapError(f"--loss {self.loss}: a share from 0 up to, not including, 1")
         config = Config() if self.config_file is None else load_config(self.config_file)
         config = msgspec.structs.replace(config, fleet_key="")  # keys follow from the names here
+        if self.unknown_frames:
+            config = msgspec.structs.replace(config, start_pose=None)
         sources = self._open_sources()
         prepare_out(self.out, self.force)
         started = time.perf_counter()
