@@ -161,6 +161,11 @@ class Agent:
         return self.observing.waiting and not self._silenced
 
     @property
+    def searching(self) -> bool:
+        """Whether the last tick compared keyframes: the frames may be placed anew soon."""
+        return self.placing.busy
+
+    @property
     def _silenced(self) -> bool:
         """Whether the key was used twice, or revoked: what it signs counts no more."""
         own = self.ledger.chain(self.identity.author)

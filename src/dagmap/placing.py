@@ -51,8 +51,10 @@ class _Keyframe:
     pose: Int32s  # (7,) of the anchor
     place: Floats = field(init=False)  # (4, 4) mm
     points: Floats = field(init=False)  # (N, 3) mm in the SLAM frame
+    depth: float = field(init=False)  # mm, median distance of a point from the sensor
 
     def __post_init__(self) -> None:
+        self.depth = float(np.median(np.linalg.norm(self.described.position, axis=1)))
         self.move(self.pose)
 
     def move(self, pose: Int32s) -> None:
@@ -222,10 +224,12 @@ class Placing:
         self._keyframes: dict[FrameId, list[_Keyframe]] = {}
         self._relations: dict[tuple[FrameId, FrameId], _Relation] = {}
         self._turn = 0
+        self.busy = False  # whether the last step found something to compare
 
     def step(self, ledger: Ledger, consensus: Consensus) -> tuple[list[Link], bool]:
         """Links to publish, and whether this robot's described points are wanted."""
         strange = self._strange(consensus)
+        self.busy = False
         if not strange and not self._keyframes:
             return [], False  # everybody shares one frame
         self._take_in(ledger, consensus)
@@ -334,6 +338,7 @@ class Placing:
                 continue
             cost, link = next(relation.work)
             idle = idle + 1 if cost == 0 else 0
+            self.busy |= cost > 0
             left -= cost
             if link is not None:
                 links.append(link)
@@ -355,6 +360,7 @@ def _views(keyframes: list[_Keyframe]) -> Views:
         np.array([keyframe.place for keyframe in keyframes]),
         [keyframe.points for keyframe in keyframes],
         [keyframe.descriptors for keyframe in keyframes],
+        float(np.median([keyframe.depth for keyframe in keyframes])) if keyframes else 0.0,
     )
 
 

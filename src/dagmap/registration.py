@@ -21,7 +21,7 @@ RATIO = 0.8  # Lowe's test: the best match is so much nearer than the second
 SAMPLES = 400  # triples that are tried
 FACING = 64  # pairs of keyframes that are looked at for a proposal
 SHARED = 5  # points of two keyframes that agree, so that the pair counts
-BLUNT = 0.8  # of the fit: more than that beside the place is no fit
+BLUNT = 0.6  # of the fit: more than that beside the place is no fit
 _OPPOSITE = 3.0  # cost of two keyframes that cannot show the same
 _SHORT = 4  # times the tolerance: sides of a triple that fix a rotation
 
@@ -149,6 +149,7 @@ class Views:
     poses: Floats
     points: list[Floats]  # (N, 3) mm in the SLAM frame
     descriptors: list[Uint8s]  # (N, 32)
+    depth: float  # mm, median distance of a point from its sensor
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -210,16 +211,10 @@ def judge(here: Views, there: Views, pose: Floats, tolerance: float) -> Evidence
 def _facing(here: Views, there: Views, pose: Floats) -> list[tuple[int, int]]:
     """Pairs of keyframes that should show the same, by place and direction; the nearest first."""
     places = carry(pose, here.poses[:, :3, 3])
-    depth = np.median(
-        [
-            np.median(np.linalg.norm(p - q[:3, 3], axis=1))
-            for p, q in zip(there.points, there.poses, strict=True)
-        ]
-    )
     away = np.linalg.norm(places[:, None] - there.poses[None, :, :3, 3], axis=2)
     turned = pose[:3, :3] @ here.poses[:, :3, :3]
     cosine = (np.einsum("aij,bij->ab", turned, there.poses[:, :3, :3]) - 1) / 2
-    cost = away / max(float(depth), 1.0) + 2 * (1 - cosine)
+    cost = away / max(there.depth, 1.0) + 2 * (1 - cosine)
     order = np.argsort(cost, axis=None, kind="stable")[:FACING]
     order = order[cost.ravel()[order] < _OPPOSITE]
     return [(int(i) // len(there.poses), int(i) % len(there.poses)) for i in order]
@@ -248,14 +243,14 @@ def _independent(pairs: list[tuple[int, int]], each: list[int]) -> int:
 
 def _sharp(source: Floats, target: Floats, pose: Floats, about: Floats, tolerance: float) -> bool:
     """Whether clouds fit under a pose and clearly less under every one a little beside it."""
-    cell = tolerance / 2
+    cell = tolerance / 4  # with its neighbours: fits within a quarter to a half
     filled = _dilated(np.floor(target / cell).astype(np.int64))
     placed = carry(pose, source) - about
     reach = float(np.sqrt((placed**2).sum(axis=1).mean()))
     fits = _count(filled, placed + about, cell)
     if fits == 0:
         return False
-    for beside in _beside(2 * tolerance, 2 * tolerance / max(reach, tolerance)):
+    for beside in _beside(2 * tolerance, 4 * tolerance / max(reach, tolerance)):
         if _count(filled, carry(beside, placed) + about, cell) > BLUNT * fits:
             return False
     return True

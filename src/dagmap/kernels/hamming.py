@@ -31,7 +31,10 @@ def _ctpop(_: Any, word: Any) -> Any:
 
 @overload(count_bits)  # type: ignore[untyped-decorator]
 def _count_bits(word: Any) -> Any:
-    return lambda word: _ctpop(word)  # noqa: PLW0108 - numba wants a function of Python
+    def count(word: Any) -> Any:
+        return _ctpop(word)
+
+    return count
 
 
 @leaf
