@@ -156,8 +156,10 @@ class _Relation:
         """Judge a proposal; the link to publish, if that changes what is to be said."""
         evidence = judge(_views(self.here), _views(self.there), pose, self._config.tolerance_mm)
         seen = len(self.here) + len(self.there)
-        self.candidates = [c for c in self.candidates if not self._same(evidence.pose, c)]
-        self.candidates.append(_Candidate(evidence.pose, evidence, seen))
+        alike = [c for c in self.candidates if self._same(evidence.pose, c)]
+        self.candidates = [c for c in self.candidates if c not in alike]
+        alike.append(_Candidate(evidence.pose, evidence, seen))  # a bad start may end up beside it
+        self.candidates.append(max(alike, key=lambda c: c.evidence.inliers))
         self.candidates.sort(key=lambda c: (not self._holds(c), -c.evidence.inliers))
         del self.candidates[CANDIDATES:]
         return self._conclude()
