@@ -178,12 +178,11 @@ class PlacingConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
     """
 
     tolerance: float = 0.08  # m: about four times the noise of a depth camera at 3 m
-    points: int = 150  # described points of a keyframe that are sent, the first of the cycle
+    points: int = 200  # described points of a keyframe that are sent, the first of the cycle
     keyframes: int = 100  # of a session, at most
     keyframe_distance: float = 0.3  # m between keyframes that look the same way
     keyframe_turn: float = 15.0  # degrees between keyframes of one place
     inliers: int = 30  # points that must agree before a link is published
-    enough: int = 300  # with so many a link is not improved any more
     units_per_tick: int = 12  # pairs of keyframes that a tick compares, about half a ms each
 
     def __post_init__(self) -> None:
@@ -193,7 +192,6 @@ class PlacingConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
         self._require_range("keyframe_distance", 0.01, 1000.0)
         self._require_range("keyframe_turn", 1.0, 180.0)
         self._require_range("inliers", 12, 1 << 20)
-        self._require_range("enough", 12, 1 << 20)
         self._require_range("units_per_tick", 1, 10_000)
 
     @property

@@ -32,7 +32,7 @@ from .model import (
     quantise_pose,
 )
 from .payload import CERTAIN, Described, Link
-from .registration import Evidence, Views, judge, match, register
+from .registration import Evidence, Views, judge, match, register, rivals
 
 PAIRED = 6  # described points of two keyframes that agree: enough for a proposal
 GROWTH = 2  # a link is published again once so many times the points agree
@@ -91,27 +91,21 @@ class _Relation:
         self.reason = "nothing in common was seen yet"
         self.work = self._work()
 
-    @property
-    def waits(self) -> bool:
-        """Whether a better link is wanted."""
-        return self.published is None or self.published.inliers < self._config.enough
-
     def _work(self) -> Iterator[tuple[int, Link | None]]:
         """Endless: (what it cost in units, 0 when there is nothing to do; a link to publish)."""
         pairs = self._pairs()
         while True:
             if self.answer is not None and self.answer is not self._answered:
                 self._answered = self.answer
-                yield _JUDGING, self._propose(_inverse(_matrix(self.answer.pose)))
+                yield from self._propose(_inverse(_matrix(self.answer.pose)))
             pair = next(pairs)
             if pair is None:
                 yield from self._improve()
                 continue
             proposal = self._compare(*pair)
-            if proposal is None or self._known(proposal):
-                yield 1, None
-            else:
-                yield 1 + _JUDGING, self._propose(proposal)
+            yield 1, None
+            if proposal is not None and not self._known(proposal):
+                yield from self._propose(proposal)
 
     def _pairs(self) -> Iterator[tuple[_Keyframe, _Keyframe] | None]:
         """Every pair of keyframes once, also of those that come later; None while there is none."""
@@ -145,24 +139,36 @@ class _Relation:
         return known.evidence.apart(pose, known.pose) <= 4 * self._config.tolerance_mm
 
     def _improve(self) -> Iterator[tuple[int, Link | None]]:
-        """Judge again what is believed, once there is much more to judge it by."""
+        """Judge again what was proposed, once there is much more to judge it by."""
         for known in self.candidates[:]:
-            if self.waits and len(self.here) + len(self.there) >= REJUDGED * known.seen:
+            grown = len(self.here) + len(self.there) >= REJUDGED * known.seen
+            if grown and known in self.candidates:
                 self.candidates.remove(known)
-                yield _JUDGING, self._propose(known.pose)
+                yield from self._propose(known.pose)
         yield 0, None
 
-    def _propose(self, pose: Floats) -> Link | None:
-        """Judge a proposal; the link to publish, if that changes what is to be said."""
-        evidence = judge(_views(self.here), _views(self.there), pose, self._config.tolerance_mm)
-        seen = len(self.here) + len(self.there)
+    def _propose(self, pose: Floats) -> Iterator[tuple[int, Link | None]]:
+        """Judge a proposal and its rivals; at last the link to publish, if there is news."""
+        here, there = _views(self.here), _views(self.there)
+        candidate = self._judge(here, there, pose)
+        if self._holds(candidate):
+            for rival in rivals(here, there, candidate.evidence, self._config.tolerance_mm):
+                yield _JUDGING, None
+                if not self._known(rival):
+                    self._judge(here, there, rival)
+        yield _JUDGING, self._conclude()
+
+    def _judge(self, here: Views, there: Views, pose: Floats) -> _Candidate:
+        """Judge a proposal and keep it; of those that are the same the best one stays."""
+        evidence = judge(here, there, pose, self._config.tolerance_mm)
         alike = [c for c in self.candidates if self._same(evidence.pose, c)]
         self.candidates = [c for c in self.candidates if c not in alike]
-        alike.append(_Candidate(evidence.pose, evidence, seen))  # a bad start may end up beside it
-        self.candidates.append(max(alike, key=lambda c: c.evidence.inliers))
+        alike.append(_Candidate(evidence.pose, evidence, len(here.points) + len(there.points)))
+        best = max(alike, key=lambda c: c.evidence.inliers)  # a bad start may end up beside it
+        self.candidates.append(best)
         self.candidates.sort(key=lambda c: (not self._holds(c), -c.evidence.inliers))
         del self.candidates[CANDIDATES:]
-        return self._conclude()
+        return best
 
     def _holds(self, candidate: _Candidate) -> bool:
         return self._lacks(candidate.evidence) is None
@@ -236,10 +242,8 @@ class Placing:
             return [], False  # everybody shares one frame
         self._take_in(ledger, consensus)
         links = self._search(consensus)
-        wanted = bool(strange) or any(
-            r.published is not None and r.waits for r in self._relations.values()
-        )
-        return links, wanted
+        measured = any(r.published or r.answer for r in self._relations.values())
+        return links, bool(strange) or measured
 
     def why(self, consensus: Consensus) -> dict[FrameId, str]:
         """Of each frame outside of this robot's components: why it is not placed there."""
@@ -335,9 +339,6 @@ class Placing:
             relation = self._relations[turns[self._turn % len(turns)]]
             self._turn += 1
             self._hear(relation, consensus)
-            if not relation.waits:
-                idle += 1
-                continue
             cost, link = next(relation.work)
             idle = idle + 1 if cost == 0 else 0
             self.busy |= cost > 0

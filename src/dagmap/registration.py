@@ -17,10 +17,11 @@ from .kernels.hamming import nearest
 from .model import Bools, Floats, Int32s, Int64s, Uint8s
 
 FAR = 64  # bits of 256 in which the descriptors of one thing differ at most
-RATIO = 0.8  # Lowe's test: the best match is so much nearer than the second
+RATIO = 0.85  # Lowe's test: the best match is so much nearer than the second
 SAMPLES = 400  # triples that are tried
 FACING = 64  # pairs of keyframes that are looked at for a proposal
 SHARED = 5  # points of two keyframes that agree, so that the pair counts
+RIVALS = 4  # pairs of keyframes in which another placement is looked for
 BLUNT = 0.6  # of the fit: more than that beside the place is no fit
 _OPPOSITE = 3.0  # cost of two keyframes that cannot show the same
 _SHORT = 4  # times the tolerance: sides of a triple that fix a rotation
@@ -157,18 +158,23 @@ class Evidence:
     """What speaks for a proposed motion.
 
     pose: the proposal, fitted to all points that agree; inliers: how many pairs of points that look
-    alike agree on it. independent: pairs of keyframes with agreeing points that share no keyframe.
+    alike agree on it.
     spread: (3,) mm of the agreeing points. sharp: whether the clouds fit there, and clearly less
     well wherever they are pushed or turned a little. centre, radius: of the agreeing points.
     """
 
     pose: Floats
     inliers: int = 0
-    independent: int = 0
     spread: Floats = field(default_factory=lambda: np.zeros(3))
     sharp: bool = False
     centre: Floats = field(default_factory=lambda: np.zeros(3))  # in the source frame
     radius: float = 0.0
+    best: tuple[tuple[int, int], ...] = ()
+
+    @property
+    def independent(self) -> int:
+        """How many pairs of keyframes have agreeing points and no keyframe in common."""
+        return len(self.best)
 
     def apart(self, one: Floats, other: Floats) -> float:
         """How far two poses carry the agreeing points apart at most, mm, about."""
@@ -203,9 +209,26 @@ def judge(here: Views, there: Views, pose: Floats, tolerance: float) -> Evidence
         carry(pose, centre[None])[0],
         tolerance,
     )
-    independent = _independent(pairs, each)
     radius = float(np.linalg.norm(wide))
-    return Evidence(pose, int(inliers.sum()), independent, wide, sharp, centre, radius)
+    best = _independent(pairs, each)
+    return Evidence(pose, int(inliers.sum()), wide, sharp, centre, radius, best)
+
+
+def rivals(here: Views, there: Views, found: Evidence, tolerance: float) -> Iterator[Floats]:
+    """Other motions (4, 4) that the same keyframes might agree on, were it not for the found one.
+
+    Matched without the ratio test: where the world repeats itself a point has several likenesses.
+    """
+    for i, j in found.best[:RIVALS]:
+        words = here.descriptors[i].view(np.uint64), there.descriptors[j].view(np.uint64)
+        apart = np.bitwise_count(words[0][:, None] ^ words[1][None]).sum(axis=2)
+        rows, columns = np.nonzero(apart <= FAR)
+        source, target = here.points[i][rows], there.points[j][columns]
+        others = residuals(found.pose, source, target) > 2 * tolerance
+        if others.sum() >= SHARED:
+            other = register(source[others], target[others], tolerance)
+            if other is not None and other[1].sum() >= SHARED:
+                yield other[0]
 
 
 def _facing(here: Views, there: Views, pose: Floats) -> list[tuple[int, int]]:
@@ -229,16 +252,16 @@ def _agreeing(
     return here.points[i][rows[:, 0]], there.points[j][rows[:, 1]]
 
 
-def _independent(pairs: list[tuple[int, int]], each: list[int]) -> int:
-    """How many pairs of keyframes agree that have none in common; greedily, the best first."""
+def _independent(pairs: list[tuple[int, int]], each: list[int]) -> tuple[tuple[int, int], ...]:
+    """Pairs of keyframes that agree and have none in common; greedily, the best first."""
     used: tuple[set[int], set[int]] = (set(), set())
-    count = 0
+    best = []
     for size, (i, j) in sorted(zip(each, pairs, strict=True), key=lambda row: -row[0]):
         if size >= SHARED and i not in used[0] and j not in used[1]:
             used[0].add(i)
             used[1].add(j)
-            count += 1
-    return count
+            best.append((i, j))
+    return tuple(best)
 
 
 def _sharp(source: Floats, target: Floats, pose: Floats, about: Floats, tolerance: float) -> bool:
