@@ -336,6 +336,28 @@ def test_a_robot_says_nothing_about_frames_of_others() -> None:
     assert ann.consensus.frames == {}
 
 
+@pytest.mark.parametrize("reach", [-1, 0, 900])
+def test_the_nearest_descriptors_are_the_nearest(reach: int) -> None:
+    from dagmap.kernels.hamming import NONE, nearest
+
+    rng = np.random.default_rng(reach + 1)
+    one, other = (rng.integers(0, 4, (n, 32)).astype(np.uint8) * 85 for n in (30, 40))
+    here, there = (rng.integers(0, 1000, (n, 3)).astype(np.int32) for n in (30, 40))
+    best, first, second = np.empty(30, np.int64), np.empty(30, np.int64), np.empty(30, np.int64)
+    back = np.empty(40, np.int64)
+    words = (d.view(np.int64).reshape(-1, 4) for d in (one, other))
+    nearest(*words, here, there, reach, best, first, second, back)
+    apart = np.unpackbits(one[:, None] ^ other[None], axis=2).sum(axis=2, dtype=np.int64)
+    if reach >= 0:
+        squared = ((here[:, None].astype(np.int64) - there[None]) ** 2).sum(axis=2)
+        apart[squared > reach * reach] = NONE
+    some, found = apart.min(axis=1) < NONE, apart.min(axis=0) < NONE
+    assert best.tolist() == np.where(some, apart.argmin(axis=1), -1).tolist()
+    assert back.tolist() == np.where(found, apart.argmin(axis=0), -1).tolist()
+    assert first.tolist() == np.sort(apart, axis=1)[:, 0].tolist()
+    assert second.tolist() == np.sort(apart, axis=1)[:, 1].tolist()
+
+
 def test_described_points_must_be_points() -> None:
     from dagmap.payload import Payload, decode_payload, encode_payload
     from dagmap.wire import Refusal

@@ -31,6 +31,7 @@ from ..io.figures import (
 )
 from ..io.report import write_report
 from ..io.sources import Source, open_source
+from ..io.status import unplaced
 from ..io.store import Store
 from ..model import Accepted, Cycle, DagmapError, Floats, State
 from ..sim.fleet import Fleet
@@ -219,6 +220,11 @@ class Replay:
                 row["digest"][:16],
             )
         console.print(table)
+        for row in summary["robots"]:
+            for other in row["unplaced"]:
+                console.print(
+                    f"{row['name']} does not know where {other['name']} is: {other['why']}"
+                )
         nodes = summary["map"]
         console.print(
             f"map: {nodes['nodes']:,} nodes, {nodes['confirmed']:,} confirmed by several robots, "
@@ -239,6 +245,8 @@ def _row(robot: Robot, digest: bytes) -> dict[str, Any]:
         "transactions": robot.transactions,
         "bytes_sent": robot.bytes_sent,
         "bytes_received": robot.bytes_received,
+        "placed": robot.agent.frame() is not None,
+        "unplaced": unplaced(robot.agent),
     }
 
 
