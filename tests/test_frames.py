@@ -36,7 +36,7 @@ def test_the_lowest_author_is_the_origin() -> None:
 
 
 def test_components_stay_apart_until_a_link_joins_them() -> None:
-    links = [link(B, A, 5), link(D, C, 5)]
+    links = [*both(B, A, 5), *both(D, C, 5)]
     placed = place_frames(links)
     assert placed[B][0] == A and placed[D][0] == C
     joined = place_frames([*links, *both(C, B, 1, 3.0)])

@@ -5,13 +5,14 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 
 from dagmap import Agent, Config, Cycle
-from dagmap.config import PlacingConfig
+from dagmap.config import PlacingConfig, load_config
 from dagmap.frames import contradicted, place_frames
 from dagmap.messages import Transactions, encode
 from dagmap.model import FrameId, pose_matrix, quantise_pose
@@ -136,6 +137,14 @@ def test_frames_are_a_function_of_the_transactions(three: dict[str, Agent]) -> N
             if at % 4 == 0:
                 listener.tick(float(at))
         assert listener.digest() == three["ann"].digest()
+
+
+def test_a_file_can_say_that_the_start_is_unknown(tmp_path: Path) -> None:
+    (tmp_path / "fleet.toml").write_text("start_pose = []\n")
+    config = load_config(tmp_path / "fleet.toml")
+    robot = agent("ann", config)
+    robot.observe(walk(room(1), names(1))[0], 0.0)
+    assert robot.frame() is None and robot.consensus.frames == {}
 
 
 def test_who_shares_a_frame_pays_nothing() -> None:

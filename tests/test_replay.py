@@ -112,9 +112,9 @@ def test_robots_of_the_office_find_each_others_frames(tmp_path: Path) -> None:
         held = Agent.restore(Identity.from_seed(bytes(32)), Config(start_pose=None), list(store))
     assert held.digest().hex() == summary["digest"]
     authors = {a.name: a for a in held.consensus.authors.values()}
-    poses = {
-        name: pose_matrix(held.consensus.frames[FrameId(a.id)][1]) for name, a in authors.items()
-    }
+    frames = held.consensus.frames
+    poses = {name: pose_matrix(frames[FrameId(a.id)][1]) for name, a in authors.items()}
+
     for one, other in (("robot1", "robot2"), ("robot2", "robot3"), ("robot1", "robot3")):
         truth = starts[other] @ np.linalg.inv(starts[one])
         off = np.linalg.inv(truth) @ np.linalg.inv(poses[other]) @ poses[one]

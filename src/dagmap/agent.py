@@ -210,7 +210,7 @@ class Agent:
     def _component(self) -> FrameId:
         """Where this robot is; before its first cycle, where it is configured to start."""
         if FrameId(*self._frame) not in self.consensus.frames and not self.observing.cycles:
-            return FLEET_FRAME if self.config.start_pose is not None else FrameId(*self._frame)
+            return FLEET_FRAME if self.config.start_pose else FrameId(*self._frame)
         return self.consensus.placement(*self._frame)[0]
 
     @property

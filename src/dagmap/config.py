@@ -209,7 +209,7 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     name: what people call this robot; empty: the hexadecimal author id. In a closed fleet the
         certificate names it.
     start_pose: (4, 4) rows of the robot's first SLAM frame in the fleet frame, metres, published as
-        a link; default identity: the robots share one frame. None: unknown.
+        a link; default identity: the robots share one frame. None, or [] in a file: unknown.
     same_origin: whether a new session of the SLAM starts in the frame of the one before.
     """
 
@@ -240,7 +240,7 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
             "fleet_key",
             "the 64 lower case hexadecimal digits are wanted that stand in the fleet's fleet.toml",
         )
-        if self.start_pose is not None:
+        if self.start_pose:
             try:
                 quantise_pose(self.start_pose, "Config: start_pose")
             except CycleError as error:

@@ -216,7 +216,7 @@ class Observing:
             return
         here = FrameId(self._author, session)
         start = self._config.start_pose
-        if not self._sessions and start is not None:
+        if not self._sessions and start:
             self._links.append(Link(here, FLEET_FRAME, quantise_pose(start), CERTAIN))
         elif self._sessions and self._config.same_origin:
             self._links.append(Link(here, before, quantise_pose(np.eye(4)), CERTAIN))

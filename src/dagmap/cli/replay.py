@@ -222,9 +222,9 @@ class Replay:
         console.print(table)
         for row in summary["robots"]:
             for other in row["unplaced"]:
-                console.print(
-                    f"{row['name']} does not know where {other['name']} is: {other['why']}"
-                )
+                whose = f"{row['name']} does not know where {other['name']} is"
+                console.print(f"{whose}: {other['why']}", soft_wrap=True)
+
         nodes = summary["map"]
         console.print(
             f"map: {nodes['nodes']:,} nodes, {nodes['confirmed']:,} confirmed by several robots, "
