@@ -51,11 +51,12 @@ def steady(folder: Path, seconds: float = 30.0) -> list[Row]:
         walk = record(folder / f"walk{i}.npz", seconds, i)
         robots.append(Robot(folder, f"robot{i}", others, walk))
     with running(*robots):
-        for robot in robots:
-            robot.start("--wait-for", "2")
+        for i, robot in enumerate(robots):  # each when it is ready: their cycles need not coincide
+            robot.start("--wait-for", str(i))
         for robot in robots:
             robot.wait_for("observed")
         time.sleep(WARM)
+        since = time.monotonic_ns()
         before, at = [robot.cpu() for robot in robots], time.monotonic()
         time.sleep(seconds - WARM - 2.0)
         passed = time.monotonic() - at
@@ -63,7 +64,7 @@ def steady(folder: Path, seconds: float = 30.0) -> list[Row]:
         settle(robots, int(seconds * HERTZ))
         memory = max(robot.peak() for robot in robots)
     took = observe_ms(robots[0])
-    delays = spread_ms(robots)
+    delays = spread_ms(robots, since)
     return [
         row("processor share of a robot, most", max(spent) / passed, 0.25),
         row("sealed to folded on every robot, 95 % within, ms", quantile(delays, 95), 150),
@@ -202,8 +203,11 @@ def settle(robots: list[Robot], count: int) -> float:
     return time.monotonic() - over
 
 
-def spread_ms(robots: list[Robot]) -> np.ndarray[Any, Any]:
-    """From the step that sealed a transaction to the last robot's that has folded it, ms each."""
+def spread_ms(robots: list[Robot], since: int) -> np.ndarray[Any, Any]:
+    """From the step that sealed a transaction to the last robot's that has folded it, ms each.
+
+    Left out is what was sealed before `since`, ns: not all robots were there.
+    """
     sealed: dict[str, int] = {}
     folded: dict[str, list[int]] = {}
     for robot in robots:
@@ -213,7 +217,8 @@ def spread_ms(robots: list[Robot]) -> np.ndarray[Any, Any]:
             for id_ in filter(None, step["folded"].split(",")):
                 folded.setdefault(id_, []).append(int(step["ended_ns"]))
     assert all(len(folded[id_]) == len(robots) for id_ in sealed)
-    return np.array([(max(folded[id_]) - when) / 1e6 for id_, when in sealed.items()])
+    late = ((max(folded[id_]) - when) / 1e6 for id_, when in sealed.items() if when >= since)
+    return np.array(list(late))
 
 
 def observe_ms(robot: Robot) -> list[float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import shutil
 import tempfile
 import time
 from collections.abc import Iterator
@@ -115,11 +116,11 @@ class TestDisk:
             assert "ledger.db: cannot be written: " in b.log.splitlines()[-1]
             assert "Traceback" not in b.log
             theirs = b.identity().author.hex()
-            until(lambda: a.status()["cycles"] == 60, "a to end")
-            told = a.status()["heads"][theirs]["length"]
+            until(lambda: a.answer()["cycles"] == 60, "a to end")
+            told = a.answer()["heads"][theirs]["length"]
             b.start("--speed", 50)  # the disk has room again: it goes on where it was
             until(lambda: b.status().get("cycles") == 60 and agreed(a, b, authors=2), "agreement")
-            head = a.status()["heads"][theirs]
+            head = a.answer()["heads"][theirs]
             assert head["length"] > told > 0 and head["forked_at"] is None
 
     def test_a_read_only_folder(self, nursery: Nursery) -> None:
@@ -130,6 +131,29 @@ class TestDisk:
             with pytest.raises(StoreError, match=r"a/ledger\.db: cannot be opened"):
                 open_folder(settings)
             assert list((folder / "a").iterdir()) == []
+
+    def test_an_older_backup_is_completed_by_the_others_before_it_is_gone_on_with(
+        self, nursery: Nursery, tmp_path: Path
+    ) -> None:
+        a = Robot(nursery, tmp_path, "a", record(tmp_path / "walk.npz", 1))
+        b = Robot(nursery, tmp_path, "b", connect=(a.port,))
+        lengths = []
+        with running(a, b):
+            b.start()
+            for run in range(3):
+                a.start("--speed", 20, "--wait-for", 1)
+                until(lambda: a.status().get("cycles") == 8 and agreed(a, b, authors=1), "a and b")
+                head = b.answer()["heads"][a.identity().author.hex()]
+                assert head["forked_at"] is None
+                lengths.append(head["length"])
+                assert a.stop() == 0
+                if run == 0:
+                    shutil.copy(a.ledger, tmp_path / "backup")
+                elif run == 1:
+                    assert "own transactions found" not in a.log
+                    shutil.copy(tmp_path / "backup", a.ledger)
+            assert lengths[0] < lengths[1] < lengths[2]
+            assert f'"own transactions found" count={lengths[1] - lengths[0]} ' in a.log
 
     @pytest.mark.parametrize("place", [0, 1])
     def test_a_corrupt_page(self, nursery: Nursery, tmp_path: Path, place: int) -> None:
@@ -193,7 +217,7 @@ class TestMistakes:
             robot.start()
             until(robot.status)
             self._refused(second, "ledger.db: cannot be opened: another process")
-            assert robot.status()  # which goes on
+            assert robot.answer()  # which goes on
 
     def test_parameters_under_which_the_ledger_does_not_hold(
         self, nursery: Nursery, tmp_path: Path

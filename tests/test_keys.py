@@ -20,6 +20,7 @@ from dagmap.config import TransactionConfig, load_config
 from dagmap.io.data_folder import open_folder, restore
 from dagmap.io.keys import Fleet, create_fleet, load_identity, open_fleet, open_robot
 from dagmap.io.settings import load_settings
+from dagmap.io.store import Store
 from dagmap.model import DagmapError, KeysError, Revoked, StoreError
 
 WALL = np.random.default_rng(0).uniform([2, -1, -1], [2, 1, 1], (60, 3))
@@ -254,7 +255,14 @@ def test_a_robots_process_finds_its_keys(fleet: Fleet, tmp_path: Path) -> None:
         with store:
             agent = restore(settings, identity, store, lambda data, _: data)
         assert identity.author == robot.identity.author and agent.config.name == "robot1"
-    assert {p.name for p in (tmp_path / "data").iterdir()} == {"ledger.db", "author"}
+    assert {p.name for p in (tmp_path / "data").iterdir()} == {"ledger.db"}
+    file.write_text(f"{head}keys = 'robot1'\n[store]\npath = 'elsewhere/ledger.db'\n")
+    with pytest.raises(StoreError, match="elsewhere/ledger.db: the ledger of the robot's key is"):
+        open_folder(load_settings(file))
+    assert not (tmp_path / "elsewhere" / "ledger.db").exists()
+    Store.open(tmp_path / "elsewhere" / "ledger.db", settings.config.fleet_id).close()
+    with pytest.raises(StoreError, match=r"signed for another ledger \(.*robot1/robot.ledger"):
+        open_folder(load_settings(file))
     (tmp_path / "data" / "ledger.db").unlink()
     with pytest.raises(StoreError, match="key is gone.*enroll the robot anew"):
         open_folder(settings)

@@ -256,7 +256,9 @@ def test_mistakes_on_the_command_line(streams: list[Path], tmp_path: Path) -> No
 def test_ctrl_c_leaves_valid_ledgers(tmp_path: Path) -> None:
     path = tmp_path / "long.npz"
     save_cycles(path, plain(1, count=2000, points=60, churn=False))
-    command = [sys.executable, "-c", "from dagmap.cli import main; main()"]
+    # a process that is started in the background would ignore the signal
+    heed = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    command = [sys.executable, "-c", f"{heed}; from dagmap.cli import main; main()"]
     out = tmp_path / "out"
     run = subprocess.Popen(
         [*command, "replay", str(path), "--out", str(out)], stderr=subprocess.PIPE, text=True

@@ -131,8 +131,8 @@ def test_an_answer_that_is_coming_in_is_not_asked_for_again() -> None:
     taker.tick(0.0)
     taker.receive(giver.outbox()[-1].data, 0.0)  # the announcement
 
-    def asked(now: float) -> list[Want]:
-        taker.tick(now)
+    def asked(now: float, unread: bool = False) -> list[Want]:
+        taker.tick(now, unread)
         said = (parse(out.data, taker.config)[1] for out in taker.outbox())
         return [message for message in said if isinstance(message, Want)]
 
@@ -143,7 +143,13 @@ def test_an_answer_that_is_coming_in_is_not_asked_for_again() -> None:
         now = 0.9 * patience * (i + 1)
         taker.receive(encode(Transactions((chain[i],)), them, me), now)
         assert asked(now + 0.05) == []
-    assert asked(now + patience + 0.05) == [Want(((me, 3, len(chain)),))]  # the rest was lost
+    now += patience + 0.05
+    assert asked(now, unread=True) == []  # it may be what was not read yet
+    rest = [Want(((me, 3, len(chain)),))]
+    assert asked(now) == rest  # it was lost
+    assert asked(now + patience + 0.05) == []  # the next time it gets longer
+    assert asked(now + 2 * patience + 0.05) == rest
+    assert asked(now + 100 * patience, unread=True) == rest  # a flood does not stop repair
 
 
 def test_repair_of_a_gap_asks_for_the_gap_only() -> None:

@@ -150,7 +150,7 @@ class LedgerConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     waiting_transactions: int = 4096  # the waiting room: transactions without their references
     waiting_bytes: int = 64 << 20
-    fold_per_tick: int = 100_000  # features that a tick folds at most; a read folds the rest
+    fold_per_tick: int = 25_000  # work of a tick, in features folded; a unit is about 1 us
 
     def __post_init__(self) -> None:
         self._require_range("waiting_transactions", 1, 1 << 24)

@@ -107,6 +107,11 @@ class Contribution:
         return self.transaction.key
 
     @property
+    def size(self) -> int:
+        """Observations: features and sightings."""
+        return len(self.xyz) + sum(len(sighting.numbers) for sighting in self.sightings)
+
+    @property
     def touched_cycles(self) -> set[int]:
         """Cycles whose anchors this contribution depends on."""
         return {*self.cycles.tolist(), *(sighting.cycle for sighting in self.sightings)}

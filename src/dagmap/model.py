@@ -137,7 +137,8 @@ def quantise_cycle(cycle: Cycle) -> QuantisedCycle:
     if ids is not None and len(ids) != len(points):
         raise CycleError(f"{where}: {len(ids)} ids for {len(points)} points; give one id a point")
     removed = _ids(() if cycle.removed is None else cycle.removed, f"{where}: removed")
-    if len(np.unique(removed)) != len(removed):
+    ordered = np.sort(removed)
+    if (ordered[1:] == ordered[:-1]).any():
         raise CycleError(f"{where}: removed names an id twice; name each withdrawn id once")
     if not _is_session(cycle.session):
         raise CycleError(f"{where}: session {cycle.session!r} is not a number from 0 to 2^32 - 1")

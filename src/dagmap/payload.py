@@ -306,12 +306,12 @@ def _decode_bundle(body: Reader, n_p: int) -> Bundle:
 
 def _encode_ascending(numbers: Int64s) -> bytes:
     steps = np.diff(numbers, prepend=np.int64(-1)) - 1
-    return wire.number(len(numbers)) + b"".join(map(wire.number, steps.tolist()))
+    return wire.number(len(numbers)) + wire.numbers(steps)
 
 
 def _decode_ascending(body: Reader) -> Int64s:
     count = body.number(min(_MAX_LIST, body.left))
-    steps = np.array([body.number(MAX_NUMBER) for _ in range(count)], np.int64)
+    steps = body.numbers(count, MAX_NUMBER)
     numbers = np.cumsum(steps + 1) - 1
     if count and int(numbers[-1]) > MAX_NUMBER:
         raise Refusal(Reason.MALFORMED, "feature number out of range")

@@ -11,6 +11,7 @@ import heapq
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from .config import Config
 from .ledger import Ledger
@@ -21,6 +22,7 @@ MAX_PEERS = 256  # senders are not authenticated here, so their number must be b
 _MAX_HEADS = 1800  # of one message, and of what is kept of a peer
 _MAX_IDS = 256  # of one question
 _ROOM = MAX_MESSAGE - 64  # for transactions in a message
+_UNREAD = 8  # retry periods that an answer gets on top while messages wait to be read
 Post = tuple[Message, AuthorId | None]
 
 
@@ -34,6 +36,15 @@ class Peer:
     delay: float | None = None  # s, one way, smoothed
 
 
+class Asked(NamedTuple):
+    """A question for a range of an author's chain."""
+
+    held: int  # where the range begins, or how far the answer has come
+    end: int
+    until: float  # s, when it is overdue
+    tries: int = 0  # in vain, since the last that came
+
+
 class Sync:
     """Keeps this robot's ledger and the others' alike. Time comes in as `now`, seconds."""
 
@@ -44,18 +55,20 @@ class Sync:
         self._heads: dict[AuthorId, Head] = {}
         self._token = 0
         self._sent_at: OrderedDict[int, float] = OrderedDict()
-        self._asked: OrderedDict[AuthorId, tuple[int, int, float]] = (
-            OrderedDict()
-        )  # chain: (held, end asked for, asked until)
+        self._asked: OrderedDict[AuthorId, Asked] = OrderedDict()  # about whose chain
         self._asked_ids: dict[TransactionId, float] = {}  # id: not to be asked for before
 
-    def tick(self, now: float) -> Iterator[Post]:
-        """Announcements that are due, and questions for what waiting transactions lack."""
+    def tick(self, now: float, unread: bool = False) -> Iterator[Post]:
+        """Announcements that are due, and questions for what waiting transactions lack.
+
+        unread: messages lie here that were not looked at. They may be the answers.
+        """
         if self._next_announcement is None or now >= self._next_announcement:
             self._next_announcement = now + self._config.announce_period
             yield from self._announce(now)
-        yield from self._ask_again(now)
-        yield from self._ask_for_missing(now)
+        grace = _UNREAD * self._config.retry_period if unread else 0.0
+        yield from self._ask_again(now - grace)
+        yield from self._ask_for_missing(now - grace)
 
     def heard(self, sender: AuthorId, message: Heads, now: float) -> Iterator[Post]:
         """An announcement: remember it, measure the delay, ask for what is lacking here."""
@@ -66,9 +79,8 @@ class Sync:
             peer.heads.clear()  # an announcement of several messages has one token
         peer.token, peer.heard = message.token, now
         held, waiting = self._held(), self._ledger.waiting_from()
-        for head in message.heads:
-            if held.get(head[0]) == head:  # nearly all, in a fleet that agrees
-                continue
+        news = [head for head in message.heads if held.get(head[0]) != head]  # few, mostly
+        for head in news:
             if len(peer.heads) < _MAX_HEADS and self._promises(head, waiting):
                 peer.heads[head.author] = head
         for whose, token, kept in message.echoes:
@@ -80,16 +92,22 @@ class Sync:
     def answered(self, sender: AuthorId, message: Transactions, now: float) -> Iterator[Post]:
         """Transactions came (they are in the ledger by now): ask on where the answer was cut."""
         peer = self.peers.get(sender)
-        for author, (begin, end, _) in list(self._asked.items()):
+        for author, asked in list(self._asked.items()):
             length = len(self._ledger.chain(author).main)
-            if length >= end:
+            if length >= asked.end:
                 del self._asked[author]
-            elif length > begin:  # the answer is coming: what is left of it gets its time too
-                self._asked[author] = length, end, now + self._patience(peer or Peer())
+            elif length > asked.held:  # the answer is coming: what is left of it gets its time too
+                until = now + self._patience(peer or Peer())
+                self._asked[author] = Asked(length, asked.end, until)
         if message.more and peer is not None:
             for author in peer.heads:
                 self._asked.pop(author, None)
             yield from self._ask(sender, peer, now)
+
+    def promised(self, author: AuthorId) -> bool:
+        """Whether a robot has announced more of an author than is here. It need not be true."""
+        heads = (peer.heads.get(author) for peer in self.peers.values())
+        return any(head is not None and self._wanted(head, {}) is not None for head in heads)
 
     def asked(self, sender: AuthorId, message: Want) -> Iterator[Post]:
         """Answer a question, up to `chunk_bytes`."""
@@ -146,7 +164,7 @@ class Sync:
 
     def _ask_again(self, now: float) -> Iterator[Post]:
         """Where an answer is overdue, ask another robot that has promised the same."""
-        late = [author for author, (_, _, until) in self._asked.items() if now >= until]
+        late = [author for author, asked in self._asked.items() if now >= asked.until]
         for sender, peer in list(self.peers.items()) if late else ():
             overdue = {author: peer.heads[author] for author in late if author in peer.heads}
             if overdue:
@@ -163,8 +181,11 @@ class Sync:
             if self._proves(head):
                 proofs.append(head.author)
             wanted = self._wanted(head, waiting)
-            if wanted is not None and now >= self._asked.get(head.author, (0, 0, now))[2]:
-                self._asked[head.author] = *wanted, now + self._patience(peer)
+            before = self._asked.get(head.author)
+            if wanted is not None and (before is None or now >= before.until):
+                tries = 0 if before is None else before.tries + 1
+                patience = self._patience(peer) * (1 << min(tries, 2))  # slow, rather than lost?
+                self._asked[head.author] = Asked(*wanted, now + patience, tries)
                 self._asked.move_to_end(head.author)
                 if len(self._asked) > 2 * _MAX_HEADS:
                     self._asked.popitem(last=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import signal
 import sys
@@ -58,12 +59,21 @@ class AgentCommand:
             return 0
         log = Log(sys.stderr, self.level)
         with ExitStack() as stack:
-            runtime, transport, player = self._assemble(settings, source, log, stack)
-            if player is not None:
-                player.start()
-                stack.callback(player.stop)
+            runtime, transport = self._assemble(settings, log, stack)
+            gc.collect()
+            gc.freeze()  # what is loaded by now stays: to look at it again would cost a pause
             with _signals(runtime, log):
+                runtime.listen(settings.config.network.hear_first)
+                session = next_session(runtime.agent)
+                log.write("info", "mapping", session=session)
+                player = None
+                if source is not None:
+                    ready = partial(_enough, transport, self.wait_for)
+                    player = Player(source, runtime.inbox, self.speed, session, ready)
+                    player.start()
+                    stack.callback(player.stop)
                 runtime.run(player, self.until_agreed)
+            runtime.agent.settle()
             answer = report(runtime, transport)
         log.write("info", "stopped", transactions=len(runtime.agent.ledger))
         sys.stdout.write(json.dumps(answer) + "\n" if self.json else _farewell(answer))
@@ -77,14 +87,13 @@ class AgentCommand:
         return open_source(settings.at(table.path), camera=camera, max_features=table.max_features)
 
     def _assemble(
-        self, settings: Settings, source: Source | None, log: Log, stack: ExitStack
-    ) -> tuple[Runtime, Transport, Player | None]:
-        """Everything but the first cycle. What is opened here closes with the stack."""
+        self, settings: Settings, log: Log, stack: ExitStack
+    ) -> tuple[Runtime, Transport]:
+        """Everything but the SLAM. What is opened here closes with the stack."""
         config = settings.config
         identity, store = open_folder(settings)
         stack.enter_context(store)
         agent = restore(settings, identity, store, self._track)
-        session = next_session(agent)
         inbox = _inbox(config)
         transport = stack.enter_context(
             Transport(config.network, settings.folder, config.fleet_id, identity.author, inbox)
@@ -97,11 +106,8 @@ class AgentCommand:
         stack.enter_context(StatusServer(settings.control, inbox))
         if (address := config.metrics.address) is not None:
             stack.enter_context(MetricsServer(address, runtime, transport))
-        _log_start(log, agent, settings, session)
-        if source is None:
-            return runtime, transport, None
-        ready = partial(_enough, transport, self.wait_for)
-        return runtime, transport, Player(source, inbox, self.speed, session, ready)
+        _log_start(log, agent, settings)
+        return runtime, transport
 
     def _track(self, transactions: Iterable[bytes], total: int) -> Iterable[bytes]:
         """The progress bar of a restart."""
@@ -135,7 +141,7 @@ def _enough(transport: Transport, robots: int) -> bool:
     return len(transport.here) >= robots
 
 
-def _log_start(log: Log, agent: Agent, settings: Settings, session: int) -> None:
+def _log_start(log: Log, agent: Agent, settings: Settings) -> None:
     log.write(
         "info",
         "started",
@@ -144,7 +150,6 @@ def _log_start(log: Log, agent: Agent, settings: Settings, session: int) -> None
         fleet=agent.config.fleet,
         ledger=settings.ledger,
         transactions=len(agent.ledger),
-        session=session,
     )
     if not agent.config.closed:
         log.write(

@@ -90,8 +90,8 @@ class Simulate:
                 lambda done: progress.update(task, completed=done),
             )
         if failure is not None:
-            self.console.print(f"seed {failure.seed} breaks a promise; cutting it down")
-            failure = minimised(failure)
+            with self.console.status(f"seed {failure.seed} breaks a promise; cutting it down"):
+                failure = minimised(failure)
         result = {"runs": seeds * len(scenarios), "failure": msgspec.to_builtins(failure)}
         if self.json:
             sys.stdout.write(json.dumps(result) + "\n")
@@ -125,6 +125,7 @@ def _told(failure: Failure) -> str:
             f"the shortest timeline found has {failure.timeline} events, the last of them:",
             *(f"  {line}" for line in lines[-12:]),
             f"to see it all, run this scenario with --seed {failure.seed} --timeline -",
+            f"to have it checked again, with --seed {failure.seed} --seeds 1",
             "",
             failure.scenario.toml().decode(),
         ]

@@ -22,7 +22,7 @@ from .store import Store
 
 Track = Callable[[Iterable[bytes], int], Iterable[bytes]]
 _KEY = "robot.key"
-_MADE = "author"  # in a closed fleet, whose key lies elsewhere: whose ledger was made here
+_USED = "robot.ledger"  # beside the key: the name of the one ledger that it signs for
 
 
 def load_identity(folder: Path) -> Identity:
@@ -58,25 +58,43 @@ def open_folder(settings: Settings) -> tuple[Identity, Store]:
         raise StoreError(f"{path.parent}: cannot be made ({error.strerror})") from None
     closed = settings.config.closed
     identity = keys.load_identity(settings.keys) if closed else None
+    used = (settings.keys if closed else path.parent) / _USED
     if not path.exists():
-        if (path.parent / (_MADE if closed else _KEY)).exists():
+        if used.exists() or (path.parent / _KEY).exists():
+            anew = "enroll the robot anew" if closed else f"remove {_KEY} and {_USED} too"
             raise StoreError(
                 f"{path}: the ledger of the robot's key is gone; put back its newest backup, or "
-                f"{f'enroll the robot anew and remove {_MADE}' if closed else f'remove {_KEY} too'}"
-                ": it then starts as a new one. Under its old key it would sign its numbers twice"
+                f"{anew}: it then starts as a new one. Under its old key it would sign its numbers "
+                "twice"
             )
         Store.open(path, fleet).close()  # first of all, so that a key without a ledger is a loss
     if identity is None:
         identity = load_identity(path.parent)
-    elif not (path.parent / _MADE).exists():
-        try:
-            _write_secret(path.parent / _MADE, identity.author.hex())
-        except OSError as error:
+    store = Store.open(path, fleet, identity.author)
+    try:
+        _claim(used, store)
+    except BaseException:
+        store.close()
+        raise
+    return identity, store
+
+
+def _claim(used: Path, store: Store) -> None:
+    """A key signs for one ledger: two would number two chains, and so fork the robot's own."""
+    try:
+        if not used.exists():
+            _write_secret(used, store.name.hex())
+        elif used.read_text("ascii").strip() != store.name.hex():
             raise StoreError(
-                f"{path.parent / _MADE}: cannot be written ({error.strerror}); make the folder "
-                "writable, or free some space"
-            ) from None
-    return identity, Store.open(path, fleet, identity.author)
+                f"{store.path}: the robot's key has signed for another ledger ({used} names it); "
+                "correct [store] path, or give the robot a new key"
+            )
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "damaged"
+        raise StoreError(
+            f"{used}: out of reach ({reason}); the folder of the robot's key must be writable "
+            "and have some space"
+        ) from None
 
 
 def restore(settings: Settings, identity: Identity, store: Store, track: Track) -> Agent:

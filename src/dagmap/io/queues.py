@@ -131,6 +131,11 @@ class Inbox:
             self._change.notify_all()
             return True
 
+    @property
+    def unread(self) -> bool:
+        """Whether messages wait."""
+        return bool(self._messages)
+
     def put_cycle(self, cycle: Cycle) -> bool:
         """Hand in a cycle. Waits while one is not taken yet: for the agent, never for the network.
 

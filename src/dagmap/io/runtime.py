@@ -35,6 +35,7 @@ from .queues import Inbox, Question
 TICK = 0.05  # s between the ticks of an agent, where nothing comes in
 _SOON = 0.02  # s from what came in to the tick that folds it, together with what comes meanwhile
 _STATE_PERIOD = 5.0  # s between two lines of the log that say how it stands
+_FETCH = 10  # retry periods that what others promise of the own chain gets to arrive
 _LOOK_PERIOD = 1.0  # s between two looks for transactions that a person brings
 
 
@@ -116,6 +117,26 @@ class Runtime:
         """Finish the step and return from `run`. To be called from a signal handler, too."""
         self._stopping = True
 
+    def listen(self, seconds: float) -> None:
+        """Before its chain is gone on with, hear from those in reach whether it was longer.
+
+        seconds: to wait for anybody; what is promised of the own chain gets more to arrive.
+        """
+        me, ledger, sync = self.agent.identity.author, self.agent.ledger, self.agent.sync
+        before, begun = len(ledger.chain(me).main), self.now
+        if not before:
+            return
+        fetched = begun + seconds + _FETCH * self.agent.config.sync.retry_period
+        while not self._stopping and (
+            (sync.promised(me) and self.now < fetched)
+            or (not self._heard_all(begun) and self.now < begun + seconds)
+        ):
+            self._step()
+        self.agent.resume()
+        if found := len(ledger.chain(me).main) - before:
+            meaning = "the ledger was an older copy; the others knew what it lacked"
+            self._log.write("warning", "own transactions found", count=found, meaning=meaning)
+
     def run(self, slam: Slam | None = None, until_agreed: float | None = None) -> None:
         """Work until stopped.
 
@@ -145,9 +166,10 @@ class Runtime:
             events += [event for data in self._brought() for event in self.agent.take(data)]
             self._next_look = time.monotonic() + _LOOK_PERIOD
         if (before := time.monotonic()) >= self._next_tick:
-            events += self.agent.tick(self.now)
+            events += self.agent.tick(self.now, self.inbox.unread)
             after = time.monotonic()
-            self._tick_took, self._next_tick = after - before, after + TICK
+            pause = TICK if self.agent.settled else min(max(_SOON, after - before), TICK)
+            self._tick_took, self._next_tick = after - before, after + pause
         elif any(isinstance(event, Accepted) for event in events):
             soon = max(_SOON, self._tick_took)  # folding takes half of the time at most
             self._next_tick = min(self._next_tick, before + soon)
@@ -189,7 +211,7 @@ class Runtime:
             return
         self._unfolded += [event.id for event in events if isinstance(event, Accepted)]
         sealed = [event.id for event in events if isinstance(event, Issued)]
-        folded = [] if self.agent.consensus.pending else self._unfolded
+        folded = self._unfolded if self.agent.settled else []
         if sealed or folded:
             self._log.write(
                 "debug",
@@ -281,9 +303,13 @@ class Runtime:
         """Whether all is said here, and the others were heard since the last news."""
         if self.agent.holds_back or self.network.waiting_bytes:
             return False
-        peers, last = self.agent.sync.peers, self._last_news
-        heard = all(who in peers and peers[who].heard > last for who in self.network.here)
-        return heard and self.now - last >= seconds
+        last, here = self._last_news, self.network.here
+        return (not here or self._heard_all(last)) and self.now - last >= seconds
+
+    def _heard_all(self, since: float) -> bool:
+        """Whether somebody is in reach, and all of them have announced themselves since."""
+        peers, here = self.agent.sync.peers, self.network.here
+        return bool(here) and all(who in peers and peers[who].heard > since for who in here)
 
     def _answer(self, question: Question) -> None:
         question.answer = self._report(self)

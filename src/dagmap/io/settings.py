@@ -42,6 +42,9 @@ class NetworkConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
     connect: tuple[str, ...] = ()  # endpoints of other robots, tried again and again
     scouting: bool = True  # look for robots by multicast
     gossip: bool = True  # let robots in reach tell of further ones
+    # A robot whose ledger is an older copy would sign numbers again. So one with a past waits
+    # for those in reach to say how long its chain was; s at most, where nobody is there.
+    hear_first: float = 5.0
     tls: TlsConfig | None = None
     send_bytes: int = 16 << 20  # waiting to be sent: a link that stalls for long costs no more
     receive_bytes: int = 32 << 20  # received and not looked at yet, from all robots
@@ -57,6 +60,7 @@ class NetworkConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
     def __post_init__(self) -> None:
         for name in ("send_bytes", "receive_bytes", "receive_bytes_per_robot"):
             self._require_range(name, 1 << 16, 1 << 32)
+        self._require_range("hear_first", 0.0, 3600.0)
         self._require_range("receive_messages_per_second", 10, 1 << 32)
         self._require_range("receive_messages_per_second_per_robot", 10, 1 << 32)
         self._require_range("receive_bytes_per_second_per_robot", 1 << 16, 1 << 40)

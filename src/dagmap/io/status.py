@@ -26,13 +26,13 @@ _PATH = 100  # bytes that the address of a socket has room for, and some
 def report(runtime: Runtime, transport: Transport) -> dict[str, object]:
     """Everything that `dagmap status` shows. To be called in the agent's thread."""
     agent = runtime.agent
-    pending = agent.consensus.pending
+    pending = not agent.settled
     world = agent.map
     return {
         "name": agent.config.name,
         "author": agent.identity.author.hex(),
         "fleet": agent.config.fleet,
-        "digest": agent.digest().hex(),
+        "digest": agent.digest().hex() if agent.settled else None,  # it may take long to settle
         "uptime_s": round(runtime.now, 3),
         "transactions": len(agent.ledger),
         "cycles": runtime.counts.cycles,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import secrets
 import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -53,6 +54,7 @@ class Store(Closing):
         self.path = path
         self.fleet_id = b""
         self.author: AuthorId | None = None
+        self.name = b""  # 16 random bytes that tell it from any other; made with its author
         self._database: sqlite3.Connection | None = database
 
     @classmethod
@@ -200,6 +202,7 @@ class Store(Closing):
         if "fleet" not in meta:
             raise StoreError(f"{self.path}: the file is damaged (no fleet); {_AFRESH}")
         self.fleet_id, self.author = meta["fleet"], meta.get("author")
+        self.name = meta.get("name", b"")
         if fleet_id is not None and self.fleet_id != fleet_id:
             raise StoreError(
                 f"{self.path}: the ledger of fleet {self.fleet_id.hex()}, but this robot is in "
@@ -208,8 +211,9 @@ class Store(Closing):
         if author is None:
             return
         if self.author is None:
-            database.execute("INSERT INTO meta VALUES ('author', ?)", (author,))
-            self.author = author
+            self.author, self.name = author, secrets.token_bytes(16)
+            row = [("author", author), ("name", self.name)]
+            database.executemany("INSERT INTO meta VALUES (?, ?)", row)
         elif self.author != author:
             raise StoreError(
                 f"{self.path}: the ledger of robot {self.author.hex()}, but this robot is "

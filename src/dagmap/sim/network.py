@@ -91,11 +91,20 @@ class Network:
 
     def connects(self, sender: str, receiver: str, now: float) -> bool:
         """Whether one robot hears another."""
-        if any(partition.cuts(sender, receiver, now) for partition in self._partitions):
-            return False
-        if self._link.reach is None or self._where is None:
-            return True
-        return math.dist(self._where(sender, now), self._where(receiver, now)) <= self._link.reach
+        return bool(self._hearing(sender, (receiver,), now))
+
+    def _hearing(self, sender: str, receivers: Iterable[str], now: float) -> list[str]:
+        """Which of them hear the sender."""
+        hearing = [
+            receiver
+            for receiver in receivers
+            if not any(partition.cuts(sender, receiver, now) for partition in self._partitions)
+        ]
+        reach, where = self._link.reach, self._where
+        if reach is None or where is None:
+            return hearing
+        here = where(sender, now)
+        return [name for name in hearing if math.dist(here, where(name, now)) <= reach]
 
     def send(
         self, sender: str, receivers: Iterable[str], size: int, now: float
@@ -106,9 +115,7 @@ class Network:
             return []
         link, chance = self._link, self._random
         copies = []
-        for receiver in receivers:
-            if not self.connects(sender, receiver, now):
-                continue
+        for receiver in self._hearing(sender, receivers, now):
             for _ in range(1 + (link.duplicate > 0 and chance.random() < link.duplicate)):
                 self.carried += size
                 delay = chance.uniform(*link.delay)
