@@ -36,6 +36,8 @@ from .registration import Evidence, Views, judge, match, register, rivals
 
 PAIRED = 6  # described points of two keyframes that agree: enough for a proposal
 GROWTH = 2  # a link is published again once so many times the points agree
+BETTER, FINE = 1.1, 0.125  # or so many times, and the pose has moved by so many tolerances
+COARSE = 0.5  # or it has moved by so many tolerances, whatever agrees
 RIVAL = 0.5  # another placement with such a share of the points makes it ambiguous
 REJUDGED = 1.25  # keyframes must have grown by so much before a proposal is judged again
 CANDIDATES = 8  # proposals of two frames that are kept
@@ -205,8 +207,9 @@ class _Relation:
     def _publish(self, pose: Floats, evidence: Evidence) -> Link | None:
         before = self.published
         if before is not None:
-            moved = evidence.apart(_matrix(before.pose), pose) > self._config.tolerance_mm / 2
-            if not moved and evidence.inliers < GROWTH * before.inliers:
+            moved = evidence.apart(_matrix(before.pose), pose) / self._config.tolerance_mm
+            better = evidence.inliers >= BETTER * before.inliers and moved > FINE
+            if moved <= COARSE and not better and evidence.inliers < GROWTH * before.inliers:
                 return None
         metres = pose.copy()
         metres[:3, 3] /= 1000.0
