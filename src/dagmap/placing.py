@@ -35,11 +35,9 @@ from .payload import CERTAIN, Described, Link
 from .registration import Evidence, Views, judge, match, register, rivals
 
 PAIRED = 6  # described points of two keyframes that agree: enough for a proposal
-GROWTH = 2  # a link is published again once so many times the points agree
-BETTER, FINE = 1.1, 0.125  # or so many times, and the pose has moved by so many tolerances
-COARSE = 0.5  # or it has moved by so many tolerances, whatever agrees
+GROWTH = 2  # a link is published again once what agrees fixes it so much better
 RIVAL = 0.5  # another placement with such a share of the points makes it ambiguous
-REJUDGED = 1.25  # keyframes must have grown by so much before a proposal is judged again
+REJUDGED = 1.1  # keyframes must have grown by so much before a proposal is judged again
 CANDIDATES = 8  # proposals of two frames that are kept
 _JUDGING = 12  # units: what judging a proposal costs, beside comparing two keyframes
 
@@ -88,6 +86,7 @@ class _Relation:
         self.there: list[_Keyframe] = []
         self.candidates: list[_Candidate] = []
         self.published: Link | None = None  # by this robot
+        self._weight = 0.0  # of the evidence for it
         self.answer: Link | None = None  # by the other end
         self._answered: Link | None = None  # judged already
         self.reason = "nothing in common was seen yet"
@@ -207,10 +206,10 @@ class _Relation:
     def _publish(self, pose: Floats, evidence: Evidence) -> Link | None:
         before = self.published
         if before is not None:
-            moved = evidence.apart(_matrix(before.pose), pose) / self._config.tolerance_mm
-            better = evidence.inliers >= BETTER * before.inliers and moved > FINE
-            if moved <= COARSE and not better and evidence.inliers < GROWTH * before.inliers:
+            moved = evidence.apart(_matrix(before.pose), pose) > self._config.tolerance_mm / 2
+            if not moved and evidence.weight < GROWTH * self._weight:
                 return None
+        self._weight = evidence.weight
         metres = pose.copy()
         metres[:3, 3] /= 1000.0
         self.published = Link(self.source, self.target, quantise_pose(metres), evidence.inliers)

@@ -176,6 +176,11 @@ class Evidence:
         """How many pairs of keyframes have agreeing points and no keyframe in common."""
         return len(self.best)
 
+    @property
+    def weight(self) -> float:
+        """How well the points that agree fix a rotation, the worst axis first: mm^2."""
+        return float(self.inliers * (self.spread[1] ** 2 + self.spread[2] ** 2))
+
     def apart(self, one: Floats, other: Floats) -> float:
         """How far two poses carry the agreeing points apart at most, mm, about."""
         shift = np.linalg.norm(carry(one, self.centre[None]) - carry(other, self.centre[None]))
