@@ -41,6 +41,7 @@ from .model import (
     quantise_cycle,
 )
 from .observing import Observing
+from .placing import Placing
 from .sync import Post, Sync
 from .transaction import Transaction, glance, id_of, parse, seal
 from .wire import Refusal
@@ -73,6 +74,7 @@ class Agent:
         self.consensus = Consensus(self.config, identity.salt)
         self.observing = Observing(self.config, identity.author, identity.salt)
         self.sync = Sync(self.ledger, self.config, identity.author)
+        self.placing = Placing(self.config.placing, identity.author)
         self._outbox: list[Outgoing] = []
         self._map: WorldMap | None = None
         self._map_version = -1  # of the consensus, when the map was made
@@ -148,7 +150,7 @@ class Agent:
         return self._through_the_door(bytes(data))
 
     def tick(self, now: float, unread: bool = False) -> list[Event]:
-        """Let time pass: release what the pacing held back, fold, announce, repair.
+        """Let time pass: release what the pacing held back, fold, place, announce, repair.
 
         unread: whether messages have come that were not handed in yet. What is overdue may be
         among them, so it is asked for again much later.
@@ -156,6 +158,7 @@ class Agent:
         self.observing.rearrange()
         events = self._issue(now)
         events += self._advance(self.config.ledger.fold_per_tick)
+        self.observing.relate(*self.placing.step(self.ledger, self.consensus))
         self._post(self.sync.tick(now, unread))
         return events
 
@@ -183,6 +186,11 @@ class Agent:
     def holds_back(self) -> bool:
         """Whether something that is valid still waits to be issued (the next ticks do it)."""
         return self.observing.waiting and not self._silenced
+
+    @property
+    def searching(self) -> bool:
+        """Whether the last tick compared keyframes: the frames may be placed anew soon."""
+        return self.placing.busy
 
     @property
     def _silenced(self) -> bool:
@@ -226,10 +234,16 @@ class Agent:
         return found
 
     @property
+    def unplaced(self) -> dict[FrameId, str]:
+        """SLAM frames that no links lead to from this robot's, and why: they wait, unmerged."""
+        self._advance()
+        return self.placing.why(self.consensus)
+
+    @property
     def _component(self) -> FrameId:
         """Where this robot is; before its first cycle, where it is configured to start."""
         if FrameId(*self._frame) not in self.consensus.frames and not self.observing.cycles:
-            return FLEET_FRAME if self.config.start_pose is not None else FrameId(*self._frame)
+            return FLEET_FRAME if self.config.start_pose else FrameId(*self._frame)
         return self.consensus.placement(*self._frame)[0]
 
     @property

@@ -26,6 +26,7 @@ from .model import AuthorId, Bools, FrameId, Int32s
 from .payload import Anchor
 from .transaction import Transaction
 
+MAX_SESSIONS = 256  # of one author that others look for; its features count in any case
 MAX_LINKS = 256  # of one author, the first in its chain: bounds what placing frames costs
 
 
@@ -297,6 +298,8 @@ class Consensus:
         for anchor in tx.payload.anchors:
             known = author.anchors.get(anchor.cycle)
             author.anchors[anchor.cycle] = anchor
+            if len(author.sessions) < MAX_SESSIONS:
+                author.sessions.add(anchor.session)
             if known is None or not _same(known, anchor):
                 self._restale(author.seen_in.get(anchor.cycle, ()))
         self._restale(author.retract(tx.payload.retracted))

@@ -3,7 +3,7 @@ retractions, and in the end the payloads of its transactions (sections 4.1 and 4
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import TypeAlias
 
@@ -16,6 +16,7 @@ from .issuance import Issuance
 from .kernels.codec import morton_order
 from .kernels.columns import distinct, grown
 from .kernels.geometry import apply_pose
+from .keyframes import Keyframes, fill
 from .model import (
     FLEET_FRAME,
     AuthorId,
@@ -27,11 +28,10 @@ from .model import (
     QuantisedCycle,
     quantise_pose,
 )
-from .payload import Anchor, Link, Payload, Sighting
+from .payload import CERTAIN, Anchor, Link, Payload, Sighting
 from .transaction import Transaction
 
 Settled: TypeAlias = Callable[[Int32s], Bools]  # of points (N, 3) mm in the SLAM frame
-CERTAIN = (1 << 31) - 1  # inliers of a link that was configured, not measured
 _ROOM = 50_000  # bytes of records in a transaction; below, what each costs at most
 _REARRANGED = 2048  # nodes that leave the DAG, or come back elsewhere, in one call
 _MOST_MOVED, _MOST_RETRACTED = 1024, 16_384  # that go out in one call
@@ -53,6 +53,7 @@ class Observing:
         self._moved: list[Anchor] = []  # to be published anew
         self._retracted: list[Int64s] = []
         self._links: list[Link] = []
+        self._keyframes = Keyframes(config.placing)
         self._introduced = config.closed  # there the certificate names the robot
         self._earlier: list[Issuance] = []  # of former sessions, with features held back
         self._start_frame()
@@ -160,6 +161,7 @@ class Observing:
         self._cycle_of[cycle.stamp] = number
         self._publish(Anchor(number, cycle.session, cycle.stamp, cycle.pose), now)
         self.observed += len(cycle.points)
+        self._keyframes.see(number, cycle)
         order = morton_order(cycle.points)
         if cycle.ids is not None:
             order = self._first_seen(cycle.ids, order, number)
@@ -183,6 +185,11 @@ class Observing:
         """The node of an id that the SLAM gave; -1 where it is unknown or has left."""
         return self._nodes.get(id_, -1)
 
+    def relate(self, links: Iterable[Link], wanted: bool) -> None:
+        """Publish links of the robot's own frames; and its described points, where `wanted`."""
+        self._links.extend(links)
+        self._keyframes.wanted = wanted
+
     @property
     def rearranging(self) -> bool:
         """Whether `rearrange` has something to do."""
@@ -193,7 +200,7 @@ class Observing:
         """Whether something is to be sent sooner or later."""
         if self._anchors or self._moved or self._links or self._retracted:
             return True
-        if self.rearranging:
+        if self.rearranging or self._keyframes.due:
             return True
         return any(issuance.waiting for issuance in (*self._earlier, self.issuance))
 
@@ -213,26 +220,28 @@ class Observing:
         self._retracted = [retracted[_MOST_RETRACTED:]] if len(retracted) > _MOST_RETRACTED else []
         retracted = retracted[:_MOST_RETRACTED]
         links, self._links = tuple(self._links), []
+        described = self._keyframes.take()
         name = None if self._introduced else self._config.name or None
         self._introduced = True
-        while anchors or links or name or len(retracted) or sightings or len(nodes):
+        while anchors or links or name or len(retracted) or sightings or len(nodes) or described:
             room = _ROOM - 64 * len(links)
             mine = anchors[: room // _ANCHOR]
             room -= len(mine) * _ANCHOR
             gone = retracted[: room // _NUMBER]
             room -= len(gone) * _NUMBER
             again, sightings, room = _fill(sightings, room)
+            shown, described, room = fill(described, room)
             each = _FEATURE + _PARENT * self._config.graph.n_p
             count = min(room // each, self._config.issuance.features_per_transaction)
             bundle = issuance.bundle(nodes[:count], base) if len(nodes[:count]) else None
-            yield Payload(name, tuple(mine), bundle, gone, again, links)
+            yield Payload(name, tuple(mine), bundle, gone, again, links, described=shown)
             base += len(nodes[:count])
             anchors, retracted, nodes = anchors[len(mine) :], retracted[len(gone) :], nodes[count:]
             links, name = (), None
 
     def _due(self, now: float) -> bool:
         """Whether there is something to say beside features. A mere pose can wait a while."""
-        if self._links or self._retracted or self._moved:
+        if self._links or self._retracted or self._moved or self._keyframes.due:
             return True
         since = self._anchors_since
         return since is not None and now - since >= self._config.sync.announce_period
@@ -246,11 +255,12 @@ class Observing:
                 self._earlier.append(self.issuance)
             self._start_frame()
         self.session = session
+        self._keyframes.start()
         if session in self._sessions:
             return
         here = FrameId(self._author, session)
         start = self._config.start_pose
-        if not self._sessions and start is not None:
+        if not self._sessions and start:
             self._links.append(Link(here, FLEET_FRAME, quantise_pose(start), CERTAIN))
         elif self._sessions and self._config.same_origin:
             self._links.append(Link(here, before, quantise_pose(np.eye(4)), CERTAIN))

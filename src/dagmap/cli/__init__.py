@@ -51,6 +51,12 @@ def replay(
     camera: Annotated[
         Path | None, typer.Option(help="camera.json to use instead of the folder's own.")
     ] = None,
+    unknown_frames: Annotated[
+        bool,
+        typer.Option(
+            "--unknown-frames", help="Every robot starts at its own identity and finds the others."
+        ),
+    ] = False,
     force: Annotated[bool, typer.Option(help="Replace the results in a non-empty --out.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print summary.json, no table.")] = False,
 ) -> None:
@@ -59,7 +65,17 @@ def replay(
 
     raise typer.Exit(
         Replay(
-            recordings, out, config, loss, late or [], seed, max_features, camera, force, json
+            recordings,
+            out,
+            config,
+            loss,
+            late or [],
+            seed,
+            max_features,
+            camera,
+            unknown_frames,
+            force,
+            json,
         ).run()
     )
 

@@ -40,6 +40,8 @@ def show_status(target: Path, as_json: bool) -> int:
         if direction in ("sent", "received"):
             total = sum(row["bytes"] for row in kinds.values())
             console.print(f"{direction}: {total / 1000:,.0f} kB")
+    for other in answer["unplaced"]:
+        console.print(f"not placed: {other['name']}, session {other['session']}: {other['why']}")
     console.print(_robots(answer))
     return 0
 

@@ -37,6 +37,8 @@ def report(runtime: Runtime, transport: Transport) -> dict[str, object]:
         "transactions": len(agent.ledger),
         "cycles": runtime.counts.cycles,
         "map": {"nodes": len(world), **{s.name.lower(): world.count(s) for s in State}},
+        "placed": agent.frame() is not None,
+        "unplaced": unplaced(agent),
         "heads": _heads(agent),
         "peers": _peers(agent, transport, runtime.now),
         "lag": {
@@ -49,6 +51,14 @@ def report(runtime: Runtime, transport: Transport) -> dict[str, object]:
         | {"dropped": {"sent": transport.dropped, "received": runtime.inbox.dropped}},
         "refused": {reason.value: count for reason, count in runtime.counts.refused.items()},
     }
+
+
+def unplaced(agent: Agent) -> list[dict[str, object]]:
+    """SLAM frames of which the robot does not know where they are, and why."""
+    return [
+        {"author": f.author.hex(), "name": _name(agent, f.author), "session": f.session, "why": why}
+        for f, why in sorted(agent.unplaced.items())
+    ]
 
 
 def _heads(agent: Agent) -> dict[str, object]:
