@@ -15,7 +15,7 @@ from dagmap import Agent, Config, Cycle
 from dagmap.config import PlacingConfig, load_config
 from dagmap.frames import contradicted, place_frames
 from dagmap.messages import Transactions, encode
-from dagmap.model import FrameId, pose_matrix, quantise_pose
+from dagmap.model import Accepted, FrameId, pose_matrix, quantise_pose
 from dagmap.payload import Described, Link
 from dagmap.sim.fleet import Fleet
 from dagmap.sim.robot import Robot
@@ -395,3 +395,41 @@ def test_fleets_of_robots_know_that_they_search() -> None:
         busy += [robot for robot in fleet.robots.values() if robot.agent.searching]
     assert busy and not any(robot.agent.searching for robot in fleet.robots.values())
     assert all(robot.agent.unplaced == {} for robot in fleet.robots.values())
+
+
+def _paced(budget: int) -> tuple[list[int], Agent]:
+    """Bob's units of each tick while ann's part is known and nothing new comes; and bob."""
+    config = msgspec.structs.replace(
+        UNKNOWN, placing=PlacingConfig(units_per_tick=budget, keyframe_distance=0.2)
+    )
+    ann, bob = agent("ann", config), agent("bob", config)
+    for robot, other, start in ((ann, bob, None), (bob, ann, STARTS["bob"])):
+        robot.observing.relate([], True)
+        for cycle in walk(room(1), names(1), start, seed=1 if robot is bob else 0):
+            for event in robot.observe(cycle, cycle.stamp):
+                if isinstance(event, Accepted):
+                    other.take(event.data)
+    bob.settle()
+    spent: list[int] = []
+    links: list[Link] = []
+    while not spent or bob.placing.busy:
+        found, _ = bob.placing.step(bob.ledger, bob.consensus)
+        spent.append(bob.placing.spent)
+        links += found
+    bob.observing.relate(links, True)
+    bob.tick(100.0)
+    return spent, bob
+
+
+def test_a_tick_does_its_share_of_the_work_and_no_more() -> None:
+    ample, all_at_once = _paced(10_000)
+    spent, in_pieces = _paced(5)
+    assert len(ample) < 4 and sum(spent) == sum(ample) > 100
+    piece = 30  # the most that is done in one go, whatever is left of the budget
+    assert max(spent) <= 5 + piece and sorted(spent)[len(spent) // 2] <= 8
+    links = [
+        [*robot.consensus.author(robot.identity.author).links.values()]
+        for robot in (all_at_once, in_pieces)
+    ]
+    assert len(links[0]) == 1 and links[0][0].inliers > 30
+    assert links[0][0].pose.tolist() == links[1][0].pose.tolist()

@@ -32,14 +32,15 @@ from .model import (
     quantise_pose,
 )
 from .payload import CERTAIN, Described, Link
-from .registration import Evidence, Views, judge, match, register, rivals
+from .registration import Evidence, Views, Working, compared, judge, match, register, rivals
 
-PAIRED = 6  # described points of two keyframes that agree: enough for a proposal
+PAIRED = 5  # described points of two keyframes that agree: enough for a proposal
+CLOSE = 0.5  # of the tolerance: so well they agree, since they may lie on one small thing
+FIRM = 40  # tolerances: what agrees, by number and spread, fixes the turn so well, or it is no link
 GROWTH = 2  # a link is published again once what agrees fixes it so much better
 RIVAL = 0.5  # another placement with such a share of the points makes it ambiguous
 REJUDGED = 1.1  # keyframes must have grown by so much before a proposal is judged again
 CANDIDATES = 8  # proposals of two frames that are kept
-_JUDGING = 12  # units: what judging a proposal costs, beside comparing two keyframes
 
 
 @dataclass(slots=True, eq=False)
@@ -90,10 +91,11 @@ class _Relation:
         self.answer: Link | None = None  # by the other end
         self._answered: Link | None = None  # judged already
         self.reason = "nothing in common was seen yet"
+        self.news: list[Link] = []  # to be published
         self.work = self._work()
 
-    def _work(self) -> Iterator[tuple[int, Link | None]]:
-        """Endless: (what it cost in units, 0 when there is nothing to do; a link to publish)."""
+    def _work(self) -> Iterator[int]:
+        """Endless: what the last piece of work cost in units, 0 when there was nothing to do."""
         pairs = self._pairs()
         while True:
             if self.answer is not None and self.answer is not self._answered:
@@ -104,7 +106,7 @@ class _Relation:
                 yield from self._improve()
                 continue
             proposal = self._compare(*pair)
-            yield 1, None
+            yield compared(pair[0].descriptors, pair[1].descriptors)
             if proposal is not None and not self._known(proposal):
                 yield from self._propose(proposal)
 
@@ -127,9 +129,8 @@ class _Relation:
         rows = match(one.descriptors, other.descriptors)
         if len(rows) < PAIRED:
             return None
-        found = register(
-            one.points[rows[:, 0]], other.points[rows[:, 1]], self._config.tolerance_mm
-        )
+        source, target = one.points[rows[:, 0]], other.points[rows[:, 1]]
+        found = register(source, target, CLOSE * self._config.tolerance_mm)
         return None if found is None or found[1].sum() < PAIRED else found[0]
 
     def _known(self, pose: Floats) -> bool:
@@ -139,29 +140,31 @@ class _Relation:
     def _same(self, pose: Floats, known: _Candidate) -> bool:
         return known.evidence.apart(pose, known.pose) <= 4 * self._config.tolerance_mm
 
-    def _improve(self) -> Iterator[tuple[int, Link | None]]:
+    def _improve(self) -> Working[None]:
         """Judge again what was proposed, once there is much more to judge it by."""
         for known in self.candidates[:]:
             grown = len(self.here) + len(self.there) >= REJUDGED * known.seen
             if grown and known in self.candidates:
                 self.candidates.remove(known)
                 yield from self._propose(known.pose)
-        yield 0, None
+        yield 0
 
-    def _propose(self, pose: Floats) -> Iterator[tuple[int, Link | None]]:
-        """Judge a proposal and its rivals; at last the link to publish, if there is news."""
+    def _propose(self, pose: Floats) -> Working[None]:
+        """Judge a proposal and its rivals, and publish a link if there is news."""
         here, there = _views(self.here), _views(self.there)
-        candidate = self._judge(here, there, pose)
+        candidate = yield from self._judge(here, there, pose)
         if self._holds(candidate):
-            for rival in rivals(here, there, candidate.evidence, self._config.tolerance_mm):
-                yield _JUDGING, None
+            evidence, tolerance = candidate.evidence, self._config.tolerance_mm
+            for rival in (yield from rivals(here, there, evidence, tolerance)):
                 if not self._known(rival):
-                    self._judge(here, there, rival)
-        yield _JUDGING, self._conclude()
+                    yield from self._judge(here, there, rival)
+        link = self._conclude()
+        if link is not None:
+            self.news.append(link)
 
-    def _judge(self, here: Views, there: Views, pose: Floats) -> _Candidate:
+    def _judge(self, here: Views, there: Views, pose: Floats) -> Working[_Candidate]:
         """Judge a proposal and keep it; of those that are the same the best one stays."""
-        evidence = judge(here, there, pose, self._config.tolerance_mm)
+        evidence = yield from judge(here, there, pose, self._config.tolerance_mm)
         alike = [c for c in self.candidates if self._same(evidence.pose, c)]
         self.candidates = [c for c in self.candidates if c not in alike]
         alike.append(_Candidate(evidence.pose, evidence, len(here.points) + len(there.points)))
@@ -183,6 +186,8 @@ class _Relation:
             return "only one keyframe of a robot agrees"
         if evidence.spread[1] < 2 * tolerance or evidence.spread[2] < tolerance:
             return "the points that agree lie in one plane or line"
+        if evidence.weight < (FIRM * tolerance) ** 2:
+            return "the points that agree are too few to fix the turn"
         if not evidence.sharp:
             return "the maps fit as well a little beside it"
         return None
@@ -234,18 +239,23 @@ class Placing:
         self._keyframes: dict[FrameId, list[_Keyframe]] = {}
         self._relations: dict[tuple[FrameId, FrameId], _Relation] = {}
         self._turn = 0
-        self.busy = False  # whether the last step found something to compare
+        self.spent = 0  # units of work of the last step
 
     def step(self, ledger: Ledger, consensus: Consensus) -> tuple[list[Link], bool]:
         """Links to publish, and whether this robot's described points are wanted."""
         strange = self._strange(consensus)
-        self.busy = False
+        self.spent = 0
         if not strange and not self._keyframes:
             return [], False  # everybody shares one frame
         self._take_in(ledger, consensus)
         links = self._search(consensus)
         measured = any(r.published or r.answer for r in self._relations.values())
         return links, bool(strange) or measured
+
+    @property
+    def busy(self) -> bool:
+        """Whether the last step found something to compare."""
+        return self.spent > 0
 
     def why(self, consensus: Consensus) -> dict[FrameId, str]:
         """Of each frame outside of this robot's components: why it is not placed there."""
@@ -335,18 +345,17 @@ class Placing:
     def _search(self, consensus: Consensus) -> list[Link]:
         """Spend this tick's units on the relations in turn."""
         links: list[Link] = []
-        left, idle = self._config.units_per_tick, 0
+        idle = 0
         turns = sorted(self._relations)
-        while left > 0 and idle < len(turns):
+        while self.spent < self._config.units_per_tick and idle < len(turns):
             relation = self._relations[turns[self._turn % len(turns)]]
             self._turn += 1
             self._hear(relation, consensus)
-            cost, link = next(relation.work)
+            cost = next(relation.work)
             idle = idle + 1 if cost == 0 else 0
-            self.busy |= cost > 0
-            left -= cost
-            if link is not None:
-                links.append(link)
+            self.spent += cost
+            links += relation.news
+            relation.news.clear()
         return links
 
     def _hear(self, relation: _Relation, consensus: Consensus) -> None:

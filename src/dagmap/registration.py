@@ -1,14 +1,17 @@
 """The rigid motion between two clouds of described points: match, sample, fit, judge.
 
 Coordinates are float64 millimetres here: what comes out is a proposal that its finder signs, and
-nothing that robots must compute alike. The same input gives the same output all the same.
+nothing that robots must compute alike. The same input gives the same output all the same. What
+takes long is a generator: it yields what it has done in units of about half a millisecond, so that
+it can go on in a later tick, and returns its result.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,16 +20,27 @@ from .kernels.hamming import nearest
 from .model import Bools, Floats, Int32s, Int64s, Uint8s
 
 FAR = 64  # bits of 256 in which the descriptors of one thing differ at most
-RATIO = 0.85  # Lowe's test: the best match is so much nearer than the second
+RATIO = 0.9  # Lowe's test: the best match is so much nearer than the second
 SAMPLES = 400  # triples that are tried
 FACING = 64  # pairs of keyframes that are looked at for a proposal
 SHARED = 5  # points of two keyframes that agree, so that the pair counts
 RIVALS = 4  # pairs of keyframes in which another placement is looked for
+WIDE = 4  # times the tolerance: reach of the first look at a proposal
+LOOKS = 5  # at a proposal, at most; fewer where a look adds less than a tenth to the last one
 BLUNT = 0.6  # of the fit: more than that beside the place is no fit
 _OPPOSITE = 3.0  # cost of two keyframes that cannot show the same
+_PAIRS = 1000  # of points that triples are drawn from; of more the nearest, or every n-th
+_RIVALING = 256  # described points of a keyframe in which rivals are looked for
+_CLOUD = 4000  # points of a cloud that its fit is tested with; of more every n-th
+_COMPARED = 40_000  # pairs of descriptors that a unit compares, and in the same time
+_FITTED = 40  # pairs of points that triples are tried on, or
+_DILATED = 80  # points whose cells are entered, or
+_LOOKED_UP = 4000  # points that are looked up
 _SHORT = 4  # times the tolerance: sides of a triple that fix a rotation
 
 Matches = npt.NDArray[np.int64]  # (M, 2) rows of the one and of the other cloud
+T = TypeVar("T")
+Working: TypeAlias = Generator[int, None, T]  # yields units of work
 
 
 def match(one: Uint8s, other: Uint8s) -> Matches:
@@ -39,13 +53,18 @@ def match(one: Uint8s, other: Uint8s) -> Matches:
 
 
 def match_near(
-    one: Uint8s, other: Uint8s, here: Floats, there: Floats, tolerance: float
+    one: Uint8s, other: Uint8s, here: Floats, there: Floats, reach: float, ratio: float
 ) -> Matches:
-    """The same among points (N, 3) mm that lie within the tolerance of each other.
+    """The same among points (N, 3) mm that lie within `reach` of each other.
 
-    Place stands in for the ratio test: what looks alike elsewhere does not count.
+    What looks alike elsewhere does not count, so a small reach needs no ratio test: 1.
     """
-    return _matched(one, other, _rounded(here), _rounded(there), round(tolerance), 1.0)
+    return _matched(one, other, _rounded(here), _rounded(there), round(reach), ratio)
+
+
+def compared(one: Uint8s, other: Uint8s) -> int:
+    """What matching descriptors (N, 32) with (M, 32) costs, in units."""
+    return 1 + len(one) * len(other) // _COMPARED
 
 
 def _rounded(points: Floats) -> Int32s:
@@ -188,52 +207,86 @@ class Evidence:
         return float(shift + self.radius * turn)
 
 
-def judge(here: Views, there: Views, pose: Floats, tolerance: float) -> Evidence:
-    """What speaks for a motion that carries `here` into `there`."""
-    for _ in range(2):
-        pairs = _facing(here, there, pose)
-        found = [_agreeing(here, there, i, j, pose, tolerance) for i, j in pairs]
-        sizes = [len(source) for source, _ in found]
-        if sum(sizes) < 3:
-            return Evidence(pose)
-        source = np.concatenate([source for source, _ in found])
-        target = np.concatenate([target for _, target in found])
-        refined = refine(source, target, np.ones(len(source), np.bool_), 0.75 * tolerance)
+def judge(here: Views, there: Views, pose: Floats, tolerance: float) -> Working[Evidence]:
+    """What speaks for a motion that carries `here` into `there`.
+
+    A proposal rests on a small part of a picture, so it is off far from there. The first look is
+    wide, by the ratio test; later ones see what lies near under the pose of the one before.
+    """
+    pose = yield from _widened(here, there, pose, tolerance)
+    agreed = 0
+    for _ in range(LOOKS - 1):
+        pairs, source, target, sizes = yield from _seen(here, there, pose, tolerance, False)
+        everything = np.ones(len(source), np.bool_)
+        refined = refine(source, target, everything, 0.75 * tolerance)
+        yield 1
         if refined is None:
             return Evidence(pose)
         pose, inliers = refined
+        before, agreed = agreed, int(inliers.sum())
+        if 10 * agreed <= 11 * before:
+            break
     bounds = np.cumsum([0, *sizes])
     each = [int(inliers[a:b].sum()) for a, b in pairwise(bounds)]
     agree = source[inliers]
     centre, wide = agree.mean(axis=0), spread(agree)
-    rows = [np.unique([pair[k] for pair in pairs]) for k in range(2)]
-    sharp = _sharp(
-        np.concatenate([here.points[i] for i in rows[0]]),
-        np.concatenate([there.points[j] for j in rows[1]]),
+    shown = [pair for pair, size in zip(pairs, each, strict=True) if size]
+    sharp = yield from _sharp(
+        np.concatenate([here.points[i] for i in sorted({i for i, _ in shown})]),
+        np.concatenate([there.points[j] for j in sorted({j for _, j in shown})]),
         pose,
         carry(pose, centre[None])[0],
         tolerance,
     )
     radius = float(np.linalg.norm(wide))
     best = _independent(pairs, each)
-    return Evidence(pose, int(inliers.sum()), wide, sharp, centre, radius, best)
+    return Evidence(pose, agreed, wide, sharp, centre, radius, best)
 
 
-def rivals(here: Views, there: Views, found: Evidence, tolerance: float) -> Iterator[Floats]:
+def _widened(here: Views, there: Views, pose: Floats, tolerance: float) -> Working[Floats]:
+    """The motion near a proposal that most of what looks alike there agrees on."""
+    _, source, target, _ = yield from _seen(here, there, pose, tolerance, True)
+    step = 1 + len(source) // _PAIRS
+    found = register(source[::step], target[::step], tolerance)
+    yield 1 + min(len(source), _PAIRS) // _FITTED
+    return pose if found is None else found[0]
+
+
+def _seen(
+    here: Views, there: Views, pose: Floats, tolerance: float, wide: bool
+) -> Working[tuple[list[tuple[int, int]], Floats, Floats, list[int]]]:
+    """Keyframes that face each other, their points that look alike (N, 3), and how many of each."""
+    pairs = _facing(here, there, pose)
+    found = [(np.zeros((0, 3)), np.zeros((0, 3)))]
+    for i, j in pairs:
+        found.append(_agreeing(here, there, i, j, pose, tolerance, wide))
+        yield compared(here.descriptors[i], there.descriptors[j])
+    sizes = [len(source) for source, _ in found[1:]]
+    source, target = (np.concatenate([pair[k] for pair in found]) for k in range(2))
+    return pairs, source, target, sizes
+
+
+def rivals(here: Views, there: Views, found: Evidence, tolerance: float) -> Working[list[Floats]]:
     """Other motions (4, 4) that the same keyframes might agree on, were it not for the found one.
 
     Matched without the ratio test: where the world repeats itself a point has several likenesses.
     """
+    out = []
     for i, j in found.best[:RIVALS]:
-        words = here.descriptors[i].view(np.uint64), there.descriptors[j].view(np.uint64)
+        one, other = here.descriptors[i][:_RIVALING], there.descriptors[j][:_RIVALING]
+        words = one.view(np.uint64), other.view(np.uint64)
         apart = np.bitwise_count(words[0][:, None] ^ words[1][None]).sum(axis=2)
         rows, columns = np.nonzero(apart <= FAR)
         source, target = here.points[i][rows], there.points[j][columns]
-        others = residuals(found.pose, source, target) > 2 * tolerance
-        if others.sum() >= SHARED:
-            other = register(source[others], target[others], tolerance)
-            if other is not None and other[1].sum() >= SHARED:
-                yield other[0]
+        others = np.flatnonzero(residuals(found.pose, source, target) > 2 * tolerance)
+        nearest_first = np.argsort(apart[rows, columns][others], kind="stable")
+        others = others[nearest_first[:_PAIRS]]
+        if len(others) >= SHARED:
+            motion = register(source[others], target[others], tolerance)
+            if motion is not None and motion[1].sum() >= SHARED:
+                out.append(motion[0])
+        yield 1 + compared(one, other) + len(others) // _FITTED
+    return out
 
 
 def _facing(here: Views, there: Views, pose: Floats) -> list[tuple[int, int]]:
@@ -249,11 +302,13 @@ def _facing(here: Views, there: Views, pose: Floats) -> list[tuple[int, int]]:
 
 
 def _agreeing(
-    here: Views, there: Views, i: int, j: int, pose: Floats, tolerance: float
+    here: Views, there: Views, i: int, j: int, pose: Floats, tolerance: float, wide: bool
 ) -> tuple[Floats, Floats]:
     """Points of two keyframes that look alike and come to lie together."""
     placed = carry(pose, here.points[i])
-    rows = match_near(here.descriptors[i], there.descriptors[j], placed, there.points[j], tolerance)
+    one, other = here.descriptors[i], there.descriptors[j]
+    reach, ratio = (WIDE * tolerance, RATIO) if wide else (tolerance, 1.0)
+    rows = match_near(one, other, placed, there.points[j], reach, ratio)
     return here.points[i][rows[:, 0]], there.points[j][rows[:, 1]]
 
 
@@ -269,30 +324,38 @@ def _independent(pairs: list[tuple[int, int]], each: list[int]) -> tuple[tuple[i
     return tuple(best)
 
 
-def _sharp(source: Floats, target: Floats, pose: Floats, about: Floats, tolerance: float) -> bool:
+def _sharp(
+    source: Floats, target: Floats, pose: Floats, about: Floats, tolerance: float
+) -> Working[bool]:
     """Whether clouds fit under a pose and clearly less under every one a little beside it."""
+    source, target = (cloud[:: 1 + len(cloud) // _CLOUD] for cloud in (source, target))
     cell = tolerance / 4  # with its neighbours: fits within a quarter to a half
     filled = _dilated(np.floor(target / cell).astype(np.int64))
+    yield 1 + len(target) // _DILATED
     placed = carry(pose, source) - about
-    reach = float(np.sqrt((placed**2).sum(axis=1).mean()))
     fits = _count(filled, placed + about, cell)
-    if fits == 0:
-        return False
-    for beside in _beside(2 * tolerance, 4 * tolerance / max(reach, tolerance)):
-        if _count(filled, carry(beside, placed) + about, cell) > BLUNT * fits:
+    for beside in _beside(placed, tolerance):
+        if fits == 0 or _count(filled, carry(beside, placed) + about, cell) > BLUNT * fits:
             return False
+        yield 1 + len(source) // _LOOKED_UP
     return True
 
 
-def _beside(push: float, turn: float) -> Iterator[Floats]:
-    """Twelve small motions: along and about each axis, both ways."""
+def _beside(points: Floats, tolerance: float) -> Iterator[Floats]:
+    """Twelve small motions of points (N, 3): along and about each axis, both ways.
+
+    Pushed by two tolerances, and turned so that half of the points move by four: what lies near
+    the axis stays wherever it turns.
+    """
     for axis in range(3):
+        a, b = (axis + 1) % 3, (axis + 2) % 3
+        reach = float(np.median(np.hypot(points[:, a], points[:, b])))
+        turn = 4 * tolerance / max(reach, 8 * tolerance)
         for sign in (-1.0, 1.0):
             moved = np.eye(4)
-            moved[axis, 3] = sign * push
+            moved[axis, 3] = sign * 2 * tolerance
             yield moved
             turned = np.eye(4)
-            a, b = (axis + 1) % 3, (axis + 2) % 3
             turned[a, a] = turned[b, b] = np.cos(turn)
             turned[a, b], turned[b, a] = -sign * np.sin(turn), sign * np.sin(turn)
             yield turned
