@@ -6,7 +6,7 @@ Everything is a function of the recording and a seed. Lengths are metres.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +37,7 @@ class Frame:
     points: Points  # (N, 3) in the sensor frame
     depth: npt.NDArray[np.float32]  # every COARSE-th pixel either way, 0: unknown
     false: npt.NDArray[np.bool_]  # (N,) points that are not there: displaced, or of people
+    descriptors: npt.NDArray[np.uint8] | None = None  # (N, 32) where the points are the recorded
 
     @property
     def placed(self) -> Points:
@@ -44,16 +45,20 @@ class Frame:
         return self.points @ self.pose[:3, :3].T + self.pose[:3, 3]
 
     def cycle(self) -> Cycle:
-        return Cycle(self.stamp, self.pose, self.points)
+        return Cycle(self.stamp, self.pose, self.points, descriptors=self.descriptors)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Walk:
-    """robots: the frames of each. dense: all depth pictures. camera: of all of them."""
+    """robots: the frames of each. dense: all depth pictures. camera: of all of them.
+
+    offsets: (3, 3) how far each robot's frame is off.
+    """
 
     robots: tuple[tuple[Frame, ...], ...]
     dense: Points
     camera: Camera
+    offsets: Points = field(default_factory=lambda: np.zeros((ROBOTS, 3)))
 
     def placed(self) -> Points:
         return np.concatenate([frame.placed for robot in self.robots for frame in robot])
@@ -70,7 +75,7 @@ class Walk:
 def load(folder: Path, cache: Path) -> Walk:
     """The walk without any change; ORB points and clouds are kept in `cache`."""
     camera = load_camera(folder / "camera.json")
-    kept = cache / f"{folder.resolve().name}.npz"
+    kept = cache / f"{folder.resolve().name}-described.npz"
     if not kept.exists():
         cache.mkdir(parents=True, exist_ok=True)
         part = kept.with_suffix(".part.npz")
@@ -85,6 +90,7 @@ def load(folder: Path, cache: Path) -> Walk:
             held["points"][a:b],
             held["depth"][i],
             np.zeros(b - a, np.bool_),
+            held["descriptors"][a:b],
         )
         for i, (a, b) in enumerate(zip(held["offsets"][:-1], held["offsets"][1:], strict=True))
     ]
@@ -118,6 +124,7 @@ def _extract(folder: Path, camera: Camera) -> dict[str, npt.NDArray[np.generic]]
         "stamp": np.array([c.stamp - starts[r] for c, r in zip(chosen, owner, strict=True)]),
         "pose": np.array([c.pose for c in chosen], np.float64),
         "points": np.concatenate(points),
+        "descriptors": np.concatenate([np.asarray(cycle.descriptors) for cycle in chosen]),
         "offsets": np.cumsum([0, *map(len, points)]),
         "robot": np.array(owner),
         "depth": np.array(coarse),
@@ -157,7 +164,7 @@ def shifted(walk: Walk, length: float, rng: np.random.Generator) -> Walk:
         pose[:3, 3] += offsets[robot]
         return replace(frame, pose=pose)
 
-    return walk.map(change)
+    return replace(walk.map(change), offsets=offsets)
 
 
 def peopled(walk: Walk, rng: np.random.Generator) -> Walk:
@@ -184,7 +191,7 @@ def peopled(walk: Walk, rng: np.random.Generator) -> Walk:
         kept = frame.points[~(hidden < frame.points[:, 2])]
         points = np.concatenate([kept, rays[seen] * z[seen, None]])
         false = np.arange(len(points)) >= len(kept)
-        return replace(frame, points=points, false=false)
+        return replace(frame, points=points, false=false, descriptors=None)
 
     return walk.map(change)
 
@@ -232,7 +239,8 @@ def rotating(walk: Walk, rng: np.random.Generator) -> Walk:
         points = points[rng.permutation(len(points))[: len(frame.points)]]
         noise = rng.normal(0, 0.002, len(points)) * points[:, 2]  # of a depth camera, about
         points = points * (1 + noise)[:, None]
-        frames.append(replace(frame, pose=pose, points=points, false=np.zeros(len(points), bool)))
+        false = np.zeros(len(points), bool)
+        frames.append(replace(frame, pose=pose, points=points, false=false, descriptors=None))
     return replace(walk, robots=(walk.robots[0], tuple(frames), walk.robots[2]))
 
 

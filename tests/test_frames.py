@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from dagmap.frames import place_frames
 from dagmap.kernels.geometry import apply_pose, compose, invert
 from dagmap.model import FLEET_FRAME, LIMIT_MM, FrameId, pose_matrix, quantise_pose
-from dagmap.payload import Link
+from dagmap.payload import CERTAIN, Link
 from scene import pose
 
 A, B, C, D = (FrameId(bytes([n]) * 8) for n in (1, 2, 3, 4))
@@ -33,6 +33,29 @@ def test_the_lowest_author_is_the_origin() -> None:
     assert placed[C][1][4:].tolist() == [2000, 0, 0]
     with_fleet = place_frames([link(B, A, 5, 1.0), link(A, FLEET_FRAME, 1, 10.0)])
     assert with_fleet[B][0] == FLEET_FRAME and with_fleet[B][1][4] == 11000
+
+
+def start(frame: FrameId, x: float, sigma_mm: int) -> Link:
+    return link(frame, FLEET_FRAME, CERTAIN - sigma_mm, x)
+
+
+def test_a_rough_start_is_refined_by_what_was_measured() -> None:
+    rough = [start(A, 0.0, 50), start(B, 2.0, 50), start(C, 9.0, 20)]
+    merged = place_frames(rough)
+    assert [merged[frame][1][4] for frame in (A, B, C)] == [0, 2000, 9000]
+    refined = place_frames([*rough, *both(B, A, 40, 2.06), *both(B, C, 40, -7.0)])
+    assert {refined[frame][0] for frame in (A, B, C)} == {FLEET_FRAME}
+    # the least uncertain start counts, the others follow by what was measured
+    assert [refined[frame][1][4] for frame in (A, B, C)] == [-60, 2000, 9000]
+    exact = place_frames([*rough[1:], start(A, 0.0, 0), *both(B, A, 40, 2.06)])
+    assert [exact[frame][1][4] for frame in (A, B)] == [0, 2060]
+
+
+def test_a_link_far_from_the_configured_starts_is_not_used() -> None:
+    rough = [start(A, 0.0, 50), start(B, 2.0, 50)]
+    for x, expected in ((2.59, 2590), (2.61, 2000)):  # 300 mm and three times 50 mm at each end
+        assert place_frames([*rough, *both(B, A, 90, x)])[B][1][4] == expected
+    assert place_frames([*rough, link(B, A, 90, 2.1)])[B][1][4] == 2000  # one end's word alone
 
 
 def test_components_stay_apart_until_a_link_joins_them() -> None:

@@ -15,7 +15,7 @@ from dagmap import Agent, Config, Cycle
 from dagmap.config import PlacingConfig, load_config
 from dagmap.frames import contradicted, place_frames
 from dagmap.messages import Transactions, encode
-from dagmap.model import Accepted, FrameId, pose_matrix, quantise_pose
+from dagmap.model import FLEET_FRAME, Accepted, FrameId, pose_matrix, quantise_pose
 from dagmap.payload import Described, Link
 from dagmap.sim.fleet import Fleet
 from dagmap.sim.robot import Robot
@@ -154,6 +154,25 @@ def test_who_shares_a_frame_pays_nothing() -> None:
     payloads = [tx.payload for tx in agents["ann"].ledger]
     assert payloads and not any(payload.described for payload in payloads)
     assert len(agents["ann"].map) and agents["ann"].unplaced == {}
+
+
+def test_rough_starts_are_merged_at_once_and_then_refined() -> None:
+    places, described = room(1), names(1)
+    starts = {"ann": pose(0.03, -0.02, 0.01), "bob": pose(-0.03, 0.03, 0.0, 0.01)}
+    cycles = {
+        name: walk(places, described, start, seed)
+        for seed, (name, start) in enumerate(starts.items())
+    }
+    rough = msgspec.structs.replace(UNKNOWN, start_pose=QUICK.start_pose, start_sigma=0.05)
+    first = agent("ann", rough)
+    first.observe(cycles["ann"][0], 0.0)
+    first.tick(0.0)
+    assert first.map.origin == FLEET_FRAME
+    agents = meet(rough, **cycles)
+    metres, degrees = off(relative(agents, "ann", "bob"), starts["ann"], starts["bob"])
+    assert metres < 0.02 and degrees < 0.3
+    assert all(robot.map.origin == FLEET_FRAME for robot in agents.values())
+    assert all(robot.unplaced == {} for robot in agents.values())
 
 
 Scene = Callable[[], tuple[list[Cycle], list[Cycle]]]

@@ -216,6 +216,8 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
         certificate names it.
     start_pose: (4, 4) rows of the robot's first SLAM frame in the fleet frame, metres, published as
         a link; default identity: the robots share one frame. None, or [] in a file: unknown.
+    start_sigma: metres, standard deviation of `start_pose`; 0: it is exact. Else the robot is
+        merged there at once, and moved to where it is found to be among the others.
     same_origin: whether a new session of the SLAM starts in the frame of the one before.
     """
 
@@ -228,6 +230,7 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
         (0.0, 0.0, 1.0, 0.0),
         (0.0, 0.0, 0.0, 1.0),
     )
+    start_sigma: float = 0.0
     same_origin: bool = False
     graph: GraphConfig = GraphConfig()
     issuance: IssuanceConfig = IssuanceConfig()
@@ -246,6 +249,7 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
             "fleet_key",
             "the 64 lower case hexadecimal digits are wanted that stand in the fleet's fleet.toml",
         )
+        self._require_range("start_sigma", 0.0, 100.0)
         if self.start_pose:
             try:
                 quantise_pose(self.start_pose, "Config: start_pose")

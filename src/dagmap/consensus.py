@@ -20,7 +20,7 @@ import numpy as np
 from .config import Config
 from .contribution import Author, Contribution, Key, Placement
 from .folded import TRANSACTION, Copying, Folded, Picture, frame_bytes
-from .frames import IDENTITY_POSE, place_frames
+from .frames import IDENTITY_POSE, place_frames, rough
 from .kernels.geometry import apply_pose
 from .model import AuthorId, Bools, FrameId, Int32s
 from .payload import Anchor
@@ -57,6 +57,7 @@ class Consensus:
         self._config, self._salt = config, salt
         self.authors: dict[AuthorId, Author] = {}
         self.frames: dict[FrameId, Placement] = {}
+        self.firm = self.frames  # the same without the start poses that are but rough
         self.revising = False  # something was undone that is not applied again
         self.version = 0  # of what is folded; it stays as it is in a revision
         self.folded = Folded(config.fold, salt)  # a prefix of the order, once unmarked
@@ -313,8 +314,10 @@ class Consensus:
 
     def _update_frames(self) -> None:
         before = self.frames
-        links = (link for author in self.authors.values() for link in author.links.values())
+        links = [link for author in self.authors.values() for link in author.links.values()]
         self.frames, self._links_changed = place_frames(links), False
+        firm = [link for link in links if not rough(link)]
+        self.firm = self.frames if len(firm) == len(links) else place_frames(firm)
         for author in self.authors.values():
             for cycle, keys in author.seen_in.items():
                 anchor = author.anchors.get(cycle)

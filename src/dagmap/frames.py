@@ -5,8 +5,10 @@ author zero). The spanning tree takes links by their standing, then those with t
 then the lowest ids:
   1. a robot's word on where its frame lies in the fleet's own;
   2. an author's links between frames of its own;
-  3. links that both ends have published, alike: neither end can be placed by another's word;
-  4. what only one end says, where that end stands alone: it places itself, and nobody else.
+  3. links that both ends have published, alike: neither end can be placed by another's word; but
+     not where they move a frame further than its configured start may be off;
+  4. a robot's word on where its frame lies about in the fleet's own, the least uncertain first;
+  5. what only one end says, where that end stands alone: it places itself, and nobody else.
 """
 
 from __future__ import annotations
@@ -19,10 +21,11 @@ import numpy as np
 
 from .kernels.geometry import compose, invert
 from .model import FLEET_FRAME, QUATERNION_ONE, FrameId, Int32s
-from .payload import Link
+from .payload import CERTAIN, Link
 
 IDENTITY_POSE = (1 << 30, 0, 0, 0, 0, 0, 0)
 ALIKE_MM = 300  # two ends' links agree within so much, and
+FAR_OFF = 3  # standard deviations of two configured starts, beside that
 ALIKE_W = round(QUATERNION_ONE * 0.99966)  # cosine of half the angle: 3 degrees
 Placed = dict[FrameId, tuple[FrameId, Int32s]]
 
@@ -33,7 +36,8 @@ class Standing(IntEnum):
     CONFIGURED = 0
     OWN = 1
     MUTUAL = 2
-    CLAIMED = 3
+    ROUGH = 3
+    CLAIMED = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,24 +90,40 @@ def alike(one: Int32s, other: Int32s) -> bool:
     return abs(int(turn[0])) >= ALIKE_W and int((apart * apart).sum()) <= ALIKE_MM * ALIKE_MM
 
 
+def rough(link: Link) -> bool:
+    """Whether a link is a start pose that was configured with a standard deviation."""
+    return link.target == FLEET_FRAME and link.inliers < CERTAIN
+
+
 def _edges(links: Iterable[Link]) -> list[_Edge]:
     """Links by what they rest on. Of two ends that agree the lower author's pose counts."""
     known: dict[tuple[FrameId, FrameId], Link] = {}
     for link in sorted(links, key=_bytes):
         if link.inliers and link.source != link.target:
             known[link.source, link.target] = link
+    starts = {link.source: link for link in known.values() if link.target == FLEET_FRAME}
     out = []
     for (source, target), link in known.items():
         back = known.get((target, source))
         if target == FLEET_FRAME:
-            out.append(_Edge(Standing.CONFIGURED, link.inliers, link))
+            standing = Standing.ROUGH if rough(link) else Standing.CONFIGURED
+            out.append(_Edge(standing, link.inliers, link))
         elif source.author == target.author:
             out.append(_Edge(Standing.OWN, link.inliers, link))
         elif back is None or not alike(link.pose, invert(back.pose)):
             out.append(_Edge(Standing.CLAIMED, link.inliers, link))
-        elif source < target:
+        elif source < target and _near_starts(link, starts.get(source), starts.get(target)):
             out.append(_Edge(Standing.MUTUAL, min(link.inliers, back.inliers), link))
     return out
+
+
+def _near_starts(link: Link, one: Link | None, other: Link | None) -> bool:
+    """Whether a link agrees with the configured starts of both its ends, if they have one."""
+    if one is None or other is None:
+        return True
+    off = compose(other.pose, link.pose)[4:].astype(np.int64) - one.pose[4:]
+    reach = ALIKE_MM + FAR_OFF * (2 * CERTAIN - one.inliers - other.inliers)
+    return int(abs(off).max()) <= reach
 
 
 def _bytes(link: Link) -> tuple[FrameId, FrameId, int, bytes]:

@@ -3,6 +3,7 @@ retractions, and in the end the payloads of its transactions (sections 4.1 and 4
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import TypeAlias
@@ -261,7 +262,8 @@ class Observing:
         here = FrameId(self._author, session)
         start = self._config.start_pose
         if not self._sessions and start:
-            self._links.append(Link(here, FLEET_FRAME, quantise_pose(start), CERTAIN))
+            certain = CERTAIN - math.ceil(1000 * self._config.start_sigma)
+            self._links.append(Link(here, FLEET_FRAME, quantise_pose(start), certain))
         elif self._sessions and self._config.same_origin:
             self._links.append(Link(here, before, quantise_pose(np.eye(4)), CERTAIN))
 

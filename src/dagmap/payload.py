@@ -96,7 +96,10 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Link:
-    """A measured or configured pose of frame `source` in frame `target`."""
+    """A measured or configured pose of frame `source` in frame `target`.
+
+    inliers: what speaks for it; of a configured one CERTAIN less its standard deviation in mm.
+    """
 
     source: FrameId
     target: FrameId

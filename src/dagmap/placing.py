@@ -20,6 +20,7 @@ import numpy as np
 
 from .config import PlacingConfig
 from .consensus import Consensus
+from .frames import Placed
 from .ledger import Ledger
 from .model import (
     MAX_KEYFRAMES,
@@ -243,7 +244,7 @@ class Placing:
 
     def step(self, ledger: Ledger, consensus: Consensus) -> tuple[list[Link], bool]:
         """Links to publish, and whether this robot's described points are wanted."""
-        strange = self._strange(consensus)
+        strange = self._strange(consensus, consensus.firm)
         self.spent = 0
         if not strange and not self._keyframes:
             return [], False  # everybody shares one frame
@@ -259,27 +260,33 @@ class Placing:
 
     def why(self, consensus: Consensus) -> dict[FrameId, str]:
         """Of each frame outside of this robot's components: why it is not placed there."""
-        reasons = dict.fromkeys(sorted(self._strange(consensus)), "no described points came yet")
+        reasons = dict.fromkeys(
+            sorted(self._strange(consensus, consensus.frames)), "no described points came yet"
+        )
         for (_, target), relation in sorted(self._relations.items()):
             if target in reasons and relation.there and relation.reason:
                 reasons[target] = relation.reason
         return reasons
 
-    def _strange(self, consensus: Consensus) -> set[FrameId]:
+    def _strange(self, consensus: Consensus, placed: Placed) -> set[FrameId]:
         """Frames of others, in which something was seen, that no chain of links leads to."""
+
+        def component(frame: FrameId) -> FrameId:
+            return placed[frame][0] if frame in placed else frame
+
         frames = {
             author.id: {FrameId(author.id, session) for session in author.sessions}
             for author in consensus.authors.values()
         }
         mine = frames.pop(self._me, set())
-        here = {consensus.placement(*frame)[0] for frame in mine}
+        here = {component(frame) for frame in mine}
         if len(here) > 1:  # a session of its own that is not placed is strange too
             return set().union(*frames.values(), mine)
         return {
             frame
             for theirs in frames.values()
             for frame in theirs
-            if mine and consensus.placement(*frame)[0] not in here
+            if mine and component(frame) not in here
         }
 
     def _take_in(self, ledger: Ledger, consensus: Consensus) -> None:
