@@ -124,6 +124,51 @@ def evaluate(
 
 
 @app.command()
+def export(
+    source: Annotated[
+        Path,
+        typer.Argument(help="A replay's folder, a ledger.db, an agent's TOML file, or a map.ply."),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(help="Its suffix names the format: ply pcd las laz e57 npz mcap yaml bt."),
+    ],
+    config: Annotated[
+        Path | None, typer.Option(help="TOML file under which the ledger was written.")
+    ] = None,
+    state: Annotated[
+        str, typer.Option(help="Which nodes: names with commas.")
+    ] = "confirmed,tentative",
+    robot: Annotated[
+        list[str] | None, typer.Option(help="Only what this robot saw; may be repeated.")
+    ] = None,
+    box: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(help="Lower corner, upper corner: x y z x y z, m.", metavar="X Y Z X Y Z"),
+    ] = None,
+    since: Annotated[float | None, typer.Option(help="Only what was seen from then on, s.")] = None,
+    until: Annotated[float | None, typer.Option(help="Only what was seen up to then, s.")] = None,
+    resolution: Annotated[float, typer.Option(help="m a cell, of yaml and bt.")] = 0.05,
+    height: Annotated[
+        tuple[float, float], typer.Option(help="The slice of a yaml grid, m along --up.")
+    ] = (0.1, 2.0),
+    up: Annotated[str, typer.Option(help="The axis that points up: z, -y, ...; for yaml.")] = "z",
+    free: Annotated[
+        bool, typer.Option(help="In yaml and bt: what rays passed through is free.")
+    ] = True,
+    force: Annotated[bool, typer.Option(help="Replace the file.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Write the map, or a part of it, in a format that other programs open."""
+    from ..io.writers import WriteOptions
+    from .export import Export
+
+    wanted = (tuple(robot or ()), box, since, until)
+    options = WriteOptions(resolution, height, up, free)
+    Export(source, out, config, state, wanted, options, force, json).run()
+
+
+@app.command()
 def simulate(
     scenarios: Annotated[list[Path], typer.Argument(help="TOML file of a scenario.")],
     seed: Annotated[int, typer.Option(min=0, help="What all chance is drawn from.")] = 0,
