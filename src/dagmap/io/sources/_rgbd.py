@@ -74,7 +74,10 @@ class FrontEnd:
         Depth and colour are those of the pixel that the feature rounds to; a depth of 0 or beyond
         `max_depth` is none. Raises RecordingError that names the picture.
         """
-        picture, metres = self._color(color), self._depth(depth)
+        return self.of(self._color(color), self._depth(depth))
+
+    def of(self, picture: Uint8s, metres: Floats) -> tuple[Floats, Uint8s]:
+        """The same of a picture (H, W, 3) BGR and of depths (H, W) m, NaN where there is none."""
         place = self._detect(picture)
         pixel = np.floor(place + 0.5).astype(np.int64)
         pixel = np.clip(pixel, 0, (self._camera.width - 1, self._camera.height - 1))

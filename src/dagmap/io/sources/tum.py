@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from ...model import Cycle, Floats, RecordingError
+from ._poses import SLACK, matrix, nearest
 from ._rgbd import FrontEnd, import_cv2, load_camera
-from ._source import Options, checked, folder_name, read_rows
+from ._source import Options, Skips, checked, folder_name, read_rows
 
 UNDERSTANDS = "a TUM RGB-D folder (rgb/, depth/, groundtruth.txt, camera.json)"
-_SLACK = 0.020 + 1e-9  # s: stamps no further apart are of one moment
 _PARTS = ("rgb", "depth", "groundtruth.txt", "associations.txt", "rgb.txt", "depth.txt")
 
 
@@ -46,6 +46,7 @@ class TumFolder:
     def __init__(self, path: Path, options: Options) -> None:
         self.name = folder_name(path)
         self._path, self._options = path, options
+        self.skips = Skips(options.keep_going)
         for part in ("rgb", "depth"):
             if not (path / part).is_dir():
                 raise RecordingError(
@@ -75,9 +76,15 @@ class TumFolder:
 
     def __iter__(self) -> Iterator[Cycle]:
         front = FrontEnd(self._cv2, self._camera, self._options)
+        self.skips = Skips(self._options.keep_going)
         for frame, pose in self._placed:
-            points, colors = front.points(frame.color, frame.depth)
-            yield checked(Cycle(frame.stamp, pose, points, colors=colors), self._path)
+            try:
+                points, colors = front.points(frame.color, frame.depth)
+                cycle = checked(Cycle(frame.stamp, pose, points, colors=colors), self._path)
+            except RecordingError as error:
+                self.skips.note(error)
+                continue
+            yield cycle
 
 
 def _frames(path: Path) -> list[_Frame]:
@@ -124,9 +131,9 @@ def _matched(path: Path) -> list[_Frame]:
     color_stamps = np.array([stamp for stamp, _ in colors])
     depth_stamps = np.array([stamp for stamp, _ in depths])
     frames = []
-    for (stamp, depth), i in zip(depths, _nearest(color_stamps, depth_stamps), strict=True):
-        back = _nearest(depth_stamps, color_stamps[i : i + 1])[0]
-        if abs(colors[i][0] - stamp) <= _SLACK and depths[back][1] == depth:
+    for (stamp, depth), i in zip(depths, nearest(color_stamps, depth_stamps), strict=True):
+        back = nearest(depth_stamps, color_stamps[i : i + 1])[0]
+        if abs(colors[i][0] - stamp) <= SLACK and depths[back][1] == depth:
             frames.append(_Frame(stamp, colors[i][1], depth))
     return frames
 
@@ -157,11 +164,11 @@ def _list(path: Path, part: str) -> list[tuple[float, Path]]:
 def _placed(frames: list[_Frame], file: Path) -> list[tuple[_Frame, Floats]]:
     """The frames with the pose nearest to their depth, where one lies within 20 ms."""
     stamps, poses = _trajectory(file)
-    nearest = _nearest(stamps, np.array([frame.stamp for frame in frames]))
+    closest = nearest(stamps, np.array([frame.stamp for frame in frames]))
     return [
         (frame, poses[i])
-        for frame, i in zip(frames, nearest, strict=True)
-        if abs(stamps[i] - frame.stamp) <= _SLACK
+        for frame, i in zip(frames, closest, strict=True)
+        if abs(stamps[i] - frame.stamp) <= SLACK
     ]
 
 
@@ -184,18 +191,11 @@ def _trajectory(file: Path) -> tuple[Floats, Floats]:
 def _pose(values: list[float], line: str) -> Floats:
     """(4, 4) from translation and quaternion."""
     quaternion = np.array(values[3:])
-    with np.errstate(over="ignore"):  # to infinity, which is refused
-        length = float(np.linalg.norm(quaternion))
-    if not 0.9 < length < 1.1:
+    pose = matrix(np.array(values[:3]), quaternion)
+    if pose is None:
+        with np.errstate(over="ignore"):  # to infinity, which is refused
+            length = float(np.linalg.norm(quaternion))
         raise RecordingError(f"{line}: a quaternion of length {length:.3g}; 1 is wanted")
-    x, y, z, w = quaternion / length
-    pose = np.eye(4)
-    pose[:3, 3] = values[:3]
-    pose[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
     return pose
 
 
@@ -216,11 +216,3 @@ def _require_rising(stamps: list[tuple[float, str]]) -> None:
                 f"{line}: the stamp {stamp} does not come after {before}; stamps must rise, sort "
                 "the lines and drop doubles"
             )
-
-
-def _nearest(rising: Floats, stamps: Floats) -> list[int]:
-    """Index of the nearest of some rising stamps, the earlier one of two as near."""
-    right = np.minimum(np.searchsorted(rising, stamps), len(rising) - 1)
-    left = np.maximum(right - 1, 0)
-    later = np.abs(rising[right] - stamps) < np.abs(rising[left] - stamps)
-    return [int(i) for i in np.where(later, right, left)]
