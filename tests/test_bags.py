@@ -151,13 +151,27 @@ def test_clouds_without_poses_are_registered(tmp_path: Path) -> None:
         open_source(path)
 
 
+def test_pictures_without_poses_are_registered(tmp_path: Path) -> None:
+    make = Make()
+    same = [make.camera_info(1.0)]
+    color, depth = pictures(1)
+    for i in range(3):
+        rgb = np.ascontiguousarray(color[:, :, ::-1])
+        same.append(make.image("/depth", 1.0 + i, depth, "16UC1"))
+        same.append(make.image("/color", 1.0 + i, rgb, "rgb8"))
+    path = write_bag(tmp_path / "walk.mcap", make, same)
+    assert describe_source(path).notes == ("no poses in it: odometry by OpenCV",)
+    assert [cycle.session for cycle in open_source(path)] == [0, 0, 0]
+    for cycle in open_source(path):
+        assert np.allclose(cycle.pose, np.eye(4), atol=1e-3)
+
+
 def missing(make: Make, kind: str) -> list[Message]:
     drop = {
         "tf": lambda m: m[0] == "/tf_static",
         "camera": lambda m: m[0].endswith("camera_info"),
         "colour": lambda m: m[0] == "/camera/color/image_raw",
         "depth": lambda m: m[0] == "/camera/depth/image_raw",
-        "poses": lambda m: m[0] == "/odom",
     }[kind]
     messages = lidar(make) if kind == "tf" else rgbd(make)
     return [message for message in messages if not drop(message)]
@@ -173,7 +187,6 @@ def missing(make: Make, kind: str) -> list[Message]:
         ("camera", "no camera info beside /camera/depth/image_raw; .* camera.json with --camera"),
         ("colour", "no colour pictures beside /camera/depth/image_raw"),
         ("depth", "neither clouds .* nor pictures with depth .*`dagmap inspect` lists"),
-        ("poses", r"no poses \(nav_msgs/msg/Odometry, tf or .*\) beside /camera/depth"),
     ],
 )
 def test_what_is_missing_is_named(tmp_path: Path, kind: str, said: str) -> None:

@@ -202,7 +202,7 @@ def _written(config: Config) -> bytes:
 
 PARSERS = {
     "dagmap.config": (),
-    "dagmap.io.settings": (),
+    "dagmap.io.settings": ("SourceConfig.options",),
     "dagmap.sim.scenario": (),
     "dagmap.sim.building": ("!SceneConfig*",),
     "dagmap.sim.sensor": ("!SensorConfig*",),

@@ -102,6 +102,8 @@ class Replay:
                     f"{path}: another recording is called {source.name} too; rename one of them"
                 )
             sources[source.name] = source
+            for note in getattr(source, "notes", ()):
+                self.console.print(f"{source.name}: {note}", soft_wrap=True, markup=False)
         return sources
 
     def _play(self, fleet: Fleet, sources: dict[str, Source]) -> None:

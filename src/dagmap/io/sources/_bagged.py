@@ -14,6 +14,7 @@ from . import _ros as ros
 from ._bag import Bag, Message
 from ._cloud import thinned
 from ._kiss import KissIcp
+from ._odometry import PictureOdometry
 from ._poses import SLACK, FrameTree, Trajectory, nearest
 from ._rgbd import Camera, FrontEnd, import_cv2, load_camera
 from ._source import Options, Skips, checked
@@ -178,19 +179,18 @@ class RgbdBag:
         self._cv2 = import_cv2(bag.path)
         self._camera = _camera(bag, camera, options)
         depths, colors = _Stamps(bag, depth, skips), _Stamps(bag, color, skips)
-        if not poses.known:
-            raise RecordingError(
-                f"{bag.path}: no poses ({ros.ODOMETRY}, tf or {ros.POSE}) beside {depth}; record "
-                "one of them too"
-            )
-        self.notes = (poses.check(depths.rows[0][2]),)
-        placed = _placed(poses, depths.rows)
-        _require(bag.path, depth, len(depths.rows), len(placed), poses.topic)
+        self.notes: tuple[str, ...] = ("no poses in it: odometry by OpenCV",)
+        placed: dict[int, Floats] | None = None
+        if poses.known:
+            self.notes = (poses.check(depths.rows[0][2]),)
+            placed = _placed(poses, depths.rows)
+            _require(bag.path, depth, len(depths.rows), len(placed), poses.topic)
         partner = nearest(colors.stamps, depths.stamps)
-        self._pairs: list[tuple[int, int, float, Floats]] = []
+        self._pairs: list[tuple[int, int, float, Floats | None]] = []
         for (number, stamp, _), i in zip(depths.rows, partner, strict=True):
-            if number in placed and abs(colors.rows[i][1] - stamp) <= SLACK:
-                self._pairs.append((number, colors.rows[i][0], stamp, placed[number]))
+            pose = None if placed is None else placed.get(number)
+            if abs(colors.rows[i][1] - stamp) <= SLACK and (placed is None or pose is not None):
+                self._pairs.append((number, colors.rows[i][0], stamp, pose))
         self.dropped = len(depths.rows) - len(self._pairs)
         if not self._pairs:
             raise RecordingError(
@@ -203,19 +203,23 @@ class RgbdBag:
 
     def __iter__(self) -> Iterator[Cycle]:
         front = FrontEnd(self._cv2, self._camera, self._options)
+        odometry = PictureOdometry(self._cv2, self._camera)
         for stamp, pose, depth, color in self._matched():
             try:
                 metres = self._bag.read(depth, partial(ros.depth_picture, self._cv2, depth.kind))
                 picture = self._bag.read(color, partial(ros.color_picture, self._cv2, color.kind))
                 self._check_sizes(depth, metres, picture)
+                pose = odometry.register(picture, metres) if pose is None else pose
                 points, colors = front.of(picture, metres)
-                cycle = checked(Cycle(stamp, pose, points, colors=colors), self._bag.path)
+                session = max(odometry.session, 0)
+                cycle = Cycle(stamp, pose, points, colors=colors, session=session)
+                cycle = checked(cycle, self._bag.path)
             except RecordingError as error:
                 self.skips.note(error)
                 continue
             yield cycle
 
-    def _matched(self) -> Iterator[tuple[float, Floats, Message, Message]]:
+    def _matched(self) -> Iterator[tuple[float, Floats | None, Message, Message]]:
         """Pairs as soon as both are there, in order; few messages are in memory at a time."""
         depths: dict[int, Message] = {}
         colors: dict[int, Message] = {}

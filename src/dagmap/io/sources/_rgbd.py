@@ -68,16 +68,16 @@ class FrontEnd:
         cv2.setRNGSeed(0)
         self._orb = cv2.ORB_create(nfeatures=options.max_features)
 
-    def points(self, color: Path, depth: Path) -> tuple[Floats, Uint8s]:
-        """(N, 3) metres and (N, 3) RGB of at most `max_features` features with a valid depth.
-
-        Depth and colour are those of the pixel that the feature rounds to; a depth of 0 or beyond
-        `max_depth` is none. Raises RecordingError that names the picture.
-        """
-        return self.of(self._color(color), self._depth(depth))
+    def read(self, color: Path, depth: Path) -> tuple[Uint8s, Floats]:
+        """A picture (H, W, 3) BGR and its depths (H, W) m. Raises RecordingError that names it."""
+        return self._color(color), self._depth(depth)
 
     def of(self, picture: Uint8s, metres: Floats) -> tuple[Floats, Uint8s]:
-        """The same of a picture (H, W, 3) BGR and of depths (H, W) m, NaN where there is none."""
+        """(N, 3) metres and (N, 3) RGB of at most `max_features` features with a valid depth.
+
+        Depth and colour are those of the pixel that the feature rounds to; a depth of 0 or NaN, or
+        beyond `max_depth`, is none.
+        """
         place = self._detect(picture)
         pixel = np.floor(place + 0.5).astype(np.int64)
         pixel = np.clip(pixel, 0, (self._camera.width - 1, self._camera.height - 1))

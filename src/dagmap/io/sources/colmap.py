@@ -124,7 +124,7 @@ class ColmapModel:
         if len(rows) > self._options.max_features:
             best = np.argsort(points.errors[rows], kind="stable")[: self._options.max_features]
             rows = np.sort(rows[best])
-        return rows
+        return np.asarray(rows)
 
 
 _Row: TypeAlias = tuple[int, tuple[float, ...], tuple[int, ...], float]  # id, place, RGB, error

@@ -111,7 +111,8 @@ class RtabmapDatabase:
         most = np.inf if self._options.max_depth is None else self._options.max_depth
         with np.errstate(over="ignore", invalid="ignore"):
             distance = np.sqrt((points**2).sum(axis=1))
-        return points[(distance > 0) & (distance <= most)][: self._options.max_features]
+        near = points[(distance > 0) & (distance <= most)]
+        return np.asarray(near[: self._options.max_features])
 
     def _moves(self) -> tuple[Floats, Floats] | None:
         """Stamps and poses of all nodes but the last that the optimisation has moved."""

@@ -81,7 +81,7 @@ class ScanFolder:
             self.notes = ("no poses.txt: odometry by KISS-ICP",)
         else:
             stamps, clouds, self._poses = self._placed(file, stamps, clouds)
-        self._stamps, self._clouds = stamps, clouds
+        self._stamps, self._clouds = stamps or _even(len(clouds)), clouds
 
     def __len__(self) -> int:
         return len(self._clouds)

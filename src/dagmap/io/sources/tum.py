@@ -1,4 +1,7 @@
-"""A folder as the TUM RGB-D benchmark lays it out: pictures, depth, and the poses of a SLAM."""
+"""A folder as the TUM RGB-D benchmark lays it out: pictures, depth, and the poses of a SLAM.
+
+Without poses they are found by odometry; where that loses its way, a new session begins.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from ...model import Cycle, Floats, RecordingError
+from ._odometry import PictureOdometry
 from ._poses import SLACK, matrix, nearest
 from ._rgbd import FrontEnd, import_cv2, load_camera
 from ._source import Options, Skips, checked, folder_name, read_rows
 
-UNDERSTANDS = "a TUM RGB-D folder (rgb/, depth/, groundtruth.txt, camera.json)"
+UNDERSTANDS = "a TUM RGB-D folder (rgb/, depth/, camera.json, groundtruth.txt)"
 _PARTS = ("rgb", "depth", "groundtruth.txt", "associations.txt", "rgb.txt", "depth.txt")
 
 
@@ -47,6 +51,7 @@ class TumFolder:
         self.name = folder_name(path)
         self._path, self._options = path, options
         self.skips = Skips(options.keep_going)
+        self.notes: tuple[str, ...] = ()
         for part in ("rgb", "depth"):
             if not (path / part).is_dir():
                 raise RecordingError(
@@ -62,14 +67,8 @@ class TumFolder:
         self._camera = load_camera(own if named is None else named)
         self._cv2 = import_cv2(path)
         frames = _frames(path)
-        placed = _placed(frames, path / "groundtruth.txt")
-        self.dropped = len(frames) - len(placed)
-        if not placed:
-            raise RecordingError(
-                f"{path}: none of {len(frames)} frames has a pose within 20 ms in "
-                "groundtruth.txt; check that both use the same clock"
-            )
-        self._placed = placed
+        self._placed = self._with_poses(frames, path / "groundtruth.txt")
+        self.dropped = len(frames) - len(self._placed)
 
     def __len__(self) -> int:
         return len(self._placed)
@@ -77,14 +76,32 @@ class TumFolder:
     def __iter__(self) -> Iterator[Cycle]:
         front = FrontEnd(self._cv2, self._camera, self._options)
         self.skips = Skips(self._options.keep_going)
+        odometry = PictureOdometry(self._cv2, self._camera)
         for frame, pose in self._placed:
             try:
-                points, colors = front.points(frame.color, frame.depth)
-                cycle = checked(Cycle(frame.stamp, pose, points, colors=colors), self._path)
+                picture, metres = front.read(frame.color, frame.depth)
+                pose = odometry.register(picture, metres) if pose is None else pose
+                points, colors = front.of(picture, metres)
+                session = max(odometry.session, 0)
+                cycle = Cycle(frame.stamp, pose, points, colors=colors, session=session)
+                cycle = checked(cycle, self._path)
             except RecordingError as error:
                 self.skips.note(error)
                 continue
             yield cycle
+
+    def _with_poses(self, frames: list[_Frame], file: Path) -> list[tuple[_Frame, Floats | None]]:
+        """The frames that have a pose; without a file of poses all, to be found by odometry."""
+        if not file.exists():
+            self.notes = ("no groundtruth.txt: odometry by OpenCV",)
+            return [(frame, None) for frame in frames]
+        placed = _placed(frames, file)
+        if not placed:
+            raise RecordingError(
+                f"{self._path}: none of {len(frames)} frames has a pose within 20 ms in "
+                "groundtruth.txt; check that both use the same clock"
+            )
+        return placed
 
 
 def _frames(path: Path) -> list[_Frame]:
@@ -161,7 +178,7 @@ def _list(path: Path, part: str) -> list[tuple[float, Path]]:
     return pictures
 
 
-def _placed(frames: list[_Frame], file: Path) -> list[tuple[_Frame, Floats]]:
+def _placed(frames: list[_Frame], file: Path) -> list[tuple[_Frame, Floats | None]]:
     """The frames with the pose nearest to their depth, where one lies within 20 ms."""
     stamps, poses = _trajectory(file)
     closest = nearest(stamps, np.array([frame.stamp for frame in frames]))
