@@ -171,13 +171,15 @@ def pictures(seed: int) -> tuple[np.ndarray, np.ndarray]:
     return color, depth
 
 
-def write_bag(path: Path, make: Make, messages: list[Message], **more: Any) -> Path:
+def write_bag(path: Path, make: Make, messages: list[Message], packed: Any = None) -> Path:
     """A file of ROS 1 or 2, or (without a suffix) a folder as `ros2 bag record` makes it."""
     types = make.types
     save: Callable[[Any, str], Any] = types.serialize_cdr if make.ros2 else types.serialize_ros1
     plugin = StoragePlugin.SQLITE3 if path.suffix == ".db3" else StoragePlugin.MCAP
     folder = path.with_name(path.stem + "_bag") if make.ros2 and path.suffix else path
     writer: Any = Writer1(path)
+    if packed:
+        writer.set_compression(packed)
     if make.ros2:
         writer = Writer2(folder, version=9, storage_plugin=plugin)
     with writer:

@@ -12,6 +12,7 @@ from unittest.mock import patch
 import cv2
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Writer
 
 from bags import Make, Message, pictures, pose_at, write_bag
 from dagmap.io.sources import Options, describe_source, open_source
@@ -272,6 +273,31 @@ def test_a_bag_that_was_cut_short(tmp_path: Path, name: str, part: float) -> Non
         found = []
     if part == 0.99 and name != "walk.db3":
         assert len(found) >= 4
+
+
+@pytest.mark.parametrize("packed", list(Writer.CompressionFormat))
+def test_a_packed_bag_without_its_end(tmp_path: Path, packed: Writer.CompressionFormat) -> None:
+    make = Make(ros2=False)
+    path = write_bag(tmp_path / "walk.bag", make, lidar(make), packed)
+    assert len(list(open_source(path))) == 5
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-100])
+    assert len(list(open_source(path, Options(keep_going=True)))) == 5
+
+
+def test_huge_counts_in_messages_cost_nothing(tmp_path: Path) -> None:
+    make = Make()
+    path = write_bag(tmp_path / "walk.mcap", make, lidar(make))
+    whole, name = path.read_bytes(), b"lidar\0"
+    at = whole.index(name, whole.index(b"/points"))  # the frame, then height, width, fields
+    at = (at + len(name) + 3) // 4 * 4
+    for place in range(at - 16, at + 24):
+        path.write_bytes(whole[:place] + b"\xff\xff\xff\xff" + whole[place + 4 :])
+        for keep_going in (True, False):
+            try:
+                list(open_source(path, Options(keep_going=keep_going)))
+            except RecordingError as error:
+                assert str(path) in str(error)
 
 
 @pytest.mark.parametrize("name", KINDS[:3])

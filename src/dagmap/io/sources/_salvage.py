@@ -50,8 +50,9 @@ def _ros1_chunk(
     if unpack is None:
         raise Cut(f"a chunk is packed by {name[:20]!r}")
     try:
-        data = unpack(data)
-    except (OSError, RuntimeError, ValueError, ImportError) as error:
+        size = min(int.from_bytes(header.get(b"size", b""), "little"), _MOST)
+        data = unpack(data, size)
+    except (OSError, EOFError, RuntimeError, ValueError, ImportError) as error:
         raise Cut(f"a chunk cannot be unpacked ({error})") from None
     at = 0
     while at < len(data):
@@ -115,13 +116,23 @@ def _exactly(file: IO[bytes], size: int) -> bytes:
     return data
 
 
-def _unpack_lz4(data: bytes) -> bytes:
-    return bytes(import_module("lz4.frame").decompress(data))
+def _plain(data: bytes, size: int) -> bytes:
+    return data
 
 
-_ROS1_PACKED: dict[bytes, Callable[[bytes], bytes]] = {
-    b"none": bytes,
-    b"bz2": bz2.decompress,
+def _unpack_bz2(data: bytes, size: int) -> bytes:
+    return bz2.BZ2Decompressor().decompress(data, max(size, 1))
+
+
+def _unpack_lz4(data: bytes, size: int) -> bytes:
+    unpacker = import_module("lz4.frame").LZ4FrameDecompressor()
+    return bytes(unpacker.decompress(data, max_length=max(size, 1)))
+
+
+# (bytes, how many they promise to become): no more than promised comes out.
+_ROS1_PACKED: dict[bytes, Callable[[bytes, int], bytes]] = {
+    b"none": _plain,
+    b"bz2": _unpack_bz2,
     b"lz4": _unpack_lz4,
 }
 
