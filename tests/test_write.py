@@ -21,7 +21,7 @@ from ruamel.yaml import YAML
 
 from dagmap.config import Config
 from dagmap.io.exported import Filter, MapTable, Observations, choose
-from dagmap.io.folded import read_map
+from dagmap.io.ledger_map import read_map
 from dagmap.io.sources import save_cycles
 from dagmap.io.store import Store
 from dagmap.io.writers import WriteOptions, formats, write_map

@@ -12,7 +12,7 @@ import numpy as np
 
 from .config import Config
 from .graph import AdjacencyDag
-from .kernels.columns import grown
+from .kernels.columns import distinct, grown
 from .model import Bools, Int32s, Int64s, Uint8s
 from .payload import Bundle, Sighting
 
@@ -67,10 +67,9 @@ class Issuance:
         valid = self.graph.validity(nodes) > self._config.graph.v_th
         self._ripen(nodes[valid])
 
-    def unissued_of(self, cycle: int) -> Int64s:
-        """Nodes that a cycle saw first and that are neither issued nor withdrawn, ascending."""
-        nodes = np.flatnonzero(self.cycle[: len(self.graph)] == cycle)
-        return nodes[self._open(nodes)]
+    def unissued(self) -> Int64s:
+        """Nodes that are neither issued nor withdrawn, ascending."""
+        return np.flatnonzero(self.graph.alive() & ~self.graph.issued())
 
     def see_again(self, nodes: Int64s, cycle: int) -> None:
         """Nodes that the SLAM observed once more. Only the latest such cycle is kept a node."""
@@ -134,7 +133,7 @@ class Issuance:
             return self._ripe
         per_bundle = self._config.issuance.features_per_bundle
         cores = self._ripe[self._open(self._ripe)]
-        cores = np.unique(cores)[::-1]
+        cores = distinct(cores)[::-1]
         taken, frontier, done, changed = self.graph.take(cores, per_bundle, limit)
         self._ripe = cores[done:]
         self._ripen(frontier)  # the nearest truncated inherit the core's validity (5.2)

@@ -79,9 +79,8 @@ class Sync:
             peer.heads.clear()  # an announcement of several messages has one token
         peer.token, peer.heard = message.token, now
         held, waiting = self._held(), self._ledger.waiting_from()
-        for head in message.heads:
-            if held.get(head[0]) == head:  # nearly all, in a fleet that agrees
-                continue
+        news = [head for head in message.heads if held.get(head[0]) != head]  # few, mostly
+        for head in news:
             if len(peer.heads) < _MAX_HEADS and self._promises(head, waiting):
                 peer.heads[head.author] = head
         for whose, token, kept in message.echoes:

@@ -10,7 +10,7 @@ from pathlib import Path
 import typer
 
 from ..io.exported import Filter, MapTable, choose
-from ..io.folded import read_map
+from ..io.ledger_map import read_map
 from ..io.writers import WriteOptions, formats, write_map
 from ..model import OutputError, State
 from .evaluate import states_named

@@ -210,9 +210,11 @@ class RgbdBag:
                 picture = self._bag.read(color, partial(ros.color_picture, self._cv2, color.kind))
                 self._check_sizes(depth, metres, picture)
                 pose = odometry.register(picture, metres) if pose is None else pose
-                points, colors = front.of(picture, metres)
+                points, colors, described = front.of(picture, metres)
                 session = max(odometry.session, 0)
-                cycle = Cycle(stamp, pose, points, colors=colors, session=session)
+                cycle = Cycle(
+                    stamp, pose, points, colors=colors, session=session, descriptors=described
+                )
                 cycle = checked(cycle, self._bag.path)
             except RecordingError as error:
                 self.skips.note(error)

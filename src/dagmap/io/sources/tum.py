@@ -81,9 +81,11 @@ class TumFolder:
             try:
                 picture, metres = front.read(frame.color, frame.depth)
                 pose = odometry.register(picture, metres) if pose is None else pose
-                points, colors = front.of(picture, metres)
+                points, colors, described = front.of(picture, metres)
                 session = max(odometry.session, 0)
-                cycle = Cycle(frame.stamp, pose, points, colors=colors, session=session)
+                cycle = Cycle(
+                    frame.stamp, pose, points, colors=colors, session=session, descriptors=described
+                )
                 cycle = checked(cycle, self._path)
             except RecordingError as error:
                 self.skips.note(error)

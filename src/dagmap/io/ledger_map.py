@@ -10,6 +10,7 @@ import numpy as np
 from ..config import Config, load_config
 from ..consensus import Consensus
 from ..contribution import Contribution
+from ..folded import Picture
 from ..kernels.geometry import apply_pose
 from ..ledger import Ledger
 from ..model import FLEET_FRAME, AuthorId, FrameId, Int32s, Int64s, OutputError, StoreError
@@ -89,9 +90,10 @@ def _fold(path: Path, config: Config) -> MapTable:
         consensus = _consensus(store, config)
         origin = _component(store.author, consensus, config)
     consensus.advance()
-    world = build_map(consensus, origin, config.fold.cell)
+    picture = consensus.picture(origin)
+    world = build_map(picture, config.fold.cell)
     robots = [_name(consensus, id_) for id_ in sorted(consensus.authors)]
-    seen = _observations(consensus, origin)
+    seen = _observations(consensus, picture)
     first = np.zeros(len(world), FIELDS["robot"])
     first[seen.node[::-1]] = seen.robot[::-1]  # the first in canonical order is written last
     fields = {**_verdicts(world), "robot": first, "stamp": last_seen(seen, len(world))}
@@ -132,7 +134,11 @@ def _component(author: AuthorId | None, consensus: Consensus, config: Config) ->
         newest = known.anchors[max(known.anchors)]
         return consensus.placement(author, newest.session)[0]
     start = FLEET_FRAME if config.start_pose is not None else FrameId(author or bytes(8), 0)
-    return start if consensus.nodes(start) is not None else _any_component(consensus, start)
+    return (
+        start
+        if consensus.picture(start).component is not None
+        else _any_component(consensus, start)
+    )
 
 
 def _any_component(consensus: Consensus, otherwise: FrameId) -> FrameId:
@@ -148,18 +154,16 @@ def _name(consensus: Consensus, id_: AuthorId) -> str:
     return consensus.authors[id_].name or id_.hex()
 
 
-def _observations(consensus: Consensus, origin: FrameId) -> Observations:
+def _observations(consensus: Consensus, picture: Picture) -> Observations:
     """Every observation that is in the map, in canonical order."""
     number = {id_: i for i, id_ in enumerate(sorted(consensus.authors))}
     parts = [_nothing()]
-    if consensus.nodes(origin) is not None:
-        nodes = {
-            id_: consensus.feature_nodes(origin, author)
-            for id_, author in consensus.authors.items()
-        }
-        for contribution in consensus.contributions():
-            id_ = contribution.author.id
-            parts += _of(consensus, contribution, nodes[id_], number[id_])
+    if picture.component is not None:
+        fold = picture.component.fold
+        for contribution in picture.contributions:
+            author = contribution.author
+            nodes = fold.feature_nodes(author.index)
+            parts += _of(consensus, contribution, nodes, number[author.id])
     return Observations(
         np.concatenate([p.node for p in parts]),
         np.concatenate([p.robot for p in parts]),
