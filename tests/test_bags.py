@@ -409,6 +409,9 @@ def test_depth_is_metres_whatever_its_encoding(tmp_path: Path) -> None:
     found = ros.depth_picture(cv2, kind, said)
     assert found[0, 0] == pytest.approx(6.0)
     assert np.isnan(found[0, 1])
+    _, kind, _, said = make.compressed("/depth", 1.0, data[:-5], "32FC1; compressedDepth png")
+    with pytest.raises(ros.Unusable, match="cut short or damaged"):
+        ros.depth_picture(cv2, kind, said)
     _, kind, _, said = make.compressed("/depth", 1.0, data, "16UC1; compressedDepth rvl")
     with pytest.raises(ros.Unusable, match="RVL"):
         ros.depth_picture(cv2, kind, said)

@@ -119,7 +119,7 @@ class FrontEnd:
 
     def _decode(self, path: Path, flags: int) -> npt.NDArray[Any]:
         data = read_bytes(path)
-        if not _complete(data):
+        if not complete(data):
             raise RecordingError(
                 f"{path}: the picture is truncated or damaged; copy it anew, or drop its frame"
             )
@@ -142,7 +142,7 @@ class FrontEnd:
             )
 
 
-def _complete(data: bytes) -> bool:
+def complete(data: bytes) -> bool:
     """Whether PNG or JPEG bytes are all there: OpenCV returns what is left without a word."""
     if data.startswith(_PNG):
         return _complete_png(data)

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...model import Floats, Uint8s
 from ._poses import matrix
+from ._rgbd import complete
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 IMAGE = "sensor_msgs/msg/Image"
@@ -142,8 +143,10 @@ def depth_picture(cv2: Any, kind: str, message: Any) -> Floats:
 
 
 def _decoded(cv2: Any, data: bytes, flags: int) -> Any:
+    if not complete(data):
+        raise Unusable("the compressed picture is cut short or damaged")
     try:
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
         picture = None
     if picture is None:
