@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from ..model import Accepted, Forked, Issued, MapChanged, Rejected, Revoked, Waiting
+from ..model import Accepted, Forked, Issued, MapChanged, Overloaded, Rejected, Revoked, Waiting
 from .robot import Crashed, Happening, Observed, Received, Restarted, Robot
 
 
@@ -48,6 +48,9 @@ def _text(happening: Happening) -> str | None:
             return f"proves a fork of {author.hex()} at {sequence}"
         case Revoked(author, count):
             return f"counts {'all' if count is None else count} of {author.hex()} from now on"
+        case Overloaded(load, features, waiting, _):
+            many = "all" if features is None else features
+            return f"inserts {many} a cycle at {load:.2f} of its time, {waiting} wait"
         case Crashed(moment):
             return f"crashes {moment}"
         case Restarted(transactions):
