@@ -299,7 +299,7 @@ class Agent:
         for tx in outcome.accepted:
             self._fold(tx)
             if tx.author != self.identity.author:
-                self.steering.controller.work.merged += tx.features
+                self.steering.controller.merged(tx.features)
             events.append(Accepted(tx.id, tx.data))
         if outcome.missing is not None:
             events.append(Waiting(transaction.id, outcome.missing))

@@ -65,7 +65,7 @@ class Issuance:
 
     def begin(self, now: float) -> None:
         """A cycle of the SLAM begins; the time since the last one is taken for T."""
-        if self._cycle_at is not None:
+        if self._cycle_at is not None and now > self._cycle_at:
             self._period = now - self._cycle_at
         self._cycle_at = now
 

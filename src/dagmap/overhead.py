@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from .config import Config
-from .model import AuthorId, Event, Floats, Overloaded
+from .equations import Model, Size, Work
+from .model import AuthorId, Event, Overloaded
 from .sync import Echo, Peer
 
 _AIM = 0.8  # of a limit: where a cut aims, so that the next cycle does not need another
@@ -23,50 +24,13 @@ _GIVE_BACK = 1.25  # by which a lever is given back a cycle
 _REST = 20  # calm cycles in a row before anything is given back
 _HOLD = 100  # cycles before a link that was full is tried with more
 _TRIES = 2  # cuts of N'_f before features per cycle are cut
+_SHARED = 0.9  # of C_Th that is shared out: buckets may fill at one time
 _LISTEN = 2  # announcement periods in which a newcomer says little
 _SURE = 10  # looks in a row at which a larger share must have been due
 _FEWEST = 64  # features a cycle that are always let through
 _PASS = 3e-7  # s a node that a change of N_c costs: it looks at all of them
 _DEEPEST = 64  # the rate is never cut to less than this part of the cap
 _SIZE = 12.0  # bytes of a feature on the wire, until they were measured
-
-
-@dataclass(slots=True)
-class Work:
-    """What was done, in features."""
-
-    inserted: int = 0
-    sent: int = 0
-    merged: int = 0  # of other robots
-
-    def since(self, before: Work) -> Work:
-        """What was done after `before`."""
-        return Work(
-            self.inserted - before.inserted, self.sent - before.sent, self.merged - before.merged
-        )
-
-
-class Fit:
-    """Least squares as the observations come, older ones counting less and less."""
-
-    def __init__(self, prior: Sequence[float], forget: float = 0.95) -> None:
-        """prior: what the coefficients are taken for, weakly, before anything was measured."""
-        self._prior, self._forget = np.array(prior, np.float64), forget
-        self._weight = np.diag(1e-4 / self._prior**2)
-        self._a = np.zeros((len(prior), len(prior)))
-        self._b = np.zeros(len(prior))
-
-    def add(self, row: Sequence[float], value: float) -> None:
-        """An observation: the sum of coefficients times `row` was `value`."""
-        a = np.array(row, np.float64) / max(value, 1e-9)  # errors are shares of what is measured
-        self._a = self._forget * self._a + np.outer(a, a)
-        self._b = self._forget * self._b + a
-
-    @property
-    def coefficients(self) -> Floats:
-        """(k,) never below 0: nothing takes less than no time."""
-        found = np.linalg.solve(self._a + self._weight, self._b + self._weight @ self._prior)
-        return np.asarray(np.maximum(found, 0.0))
 
 
 class Controller:
@@ -80,7 +44,7 @@ class Controller:
     def __init__(self, config: Config) -> None:
         self._config, self._limits = config, config.overhead
         self.work = Work()  # in all; the agent counts
-        self.costs = Fit((5e-6, 5e-6, 5e-6))  # s a feature inserted, sent, merged
+        self.model = Model()
         self.period: float | None = None  # s, T: between the last two cycles
         self.load = 0.0  # S / T of the last cycle
         self.n_c = config.graph.n_c
@@ -127,8 +91,14 @@ class Controller:
     def issued(self, features: int, size: int) -> None:
         """An own transaction: so the bytes that a feature takes are known."""
         self.work.sent += features
+        self.work.bundles += 1
         if features >= _FEWEST:
             self._size += 0.25 * (size / features - self._size)
+
+    def merged(self, features: int) -> None:
+        """A transaction of another robot."""
+        self.work.merged += features
+        self.work.merges += 1
 
     def sendable(self, room: int | None) -> int | None:
         """Features that may be sent now, with so many bytes; None: any number."""
@@ -161,7 +131,7 @@ class Controller:
         done, self._before = self.work.since(self._before), replace(self.work)
         self.load = spent / period
         if spent > 0:
-            self.costs.add((done.inserted, done.sent, done.merged), spent)
+            self.model.add(done, Size(nodes, self.n_c), spent)
         share = self._limits.cycle_share
         if share is None:
             return []
@@ -248,7 +218,7 @@ class _Traffic:
 
     def _share(self, robots: int) -> None:
         """Eq. (6): C_Th is shared by the N_G live robots; less at once, more after a while."""
-        share = min(self._own, self._fleet / robots)
+        share = min(self._own, _SHARED * self._fleet / robots)
         self._fits = self._fits + 1 if share > self._cap else 0
         if share < self._cap or self._fits > _SURE:
             self._cap, self._fits = share, 0

@@ -70,8 +70,9 @@ class Shaper:
         self._fill(now)
         control, own, answers = self._queues
         self._own = self._drain(control, self._own, -self._depth, now)
-        self._own = self._drain(own, self._own, 0.0, now)
         self._answers = self._drain(answers, self._answers, 0.0, now)
+        if not self._yields:
+            self._own = self._drain(own, self._own, 0.0, now)
 
     def take(self) -> list[Outgoing]:
         """What has been let out, handed over and forgotten."""
@@ -88,7 +89,7 @@ class Shaper:
         if self.rate is None:
             return None
         self._fill(now)
-        if self._queues[Urgency.OWN] or self._own < self._depth / 2:
+        if self._queues[Urgency.OWN] or self._own < self._depth / 2 or self._yields:
             return 0
         return int(max(0.0, min(self._own, self._most - self._recent)))
 
@@ -100,6 +101,11 @@ class Shaper:
         if any(out.to == to for out in queue):
             return 0
         return max(0, int(self._depth) - sum(len(out.data) for out in queue))
+
+    @property
+    def _yields(self) -> bool:
+        """Whether it is an answer's turn that the cap alone holds back."""
+        return bool(self._queues[Urgency.ANSWER]) and self._answers > 0
 
     @property
     def _depth(self) -> float:

@@ -11,8 +11,8 @@ import msgspec
 import numpy as np
 
 from ..agent import Agent, Parsers
+from ..equations import Work
 from ..model import AuthorId, ConfigError, Cycle, Event, Outgoing, TransactionId
-from ..overhead import Work
 
 Moment: TypeAlias = Literal["between", "unsynced", "unsent"]
 Timed: TypeAlias = tuple[float, Cycle]  # when a cycle is handed in, s of simulated time
