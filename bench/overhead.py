@@ -147,7 +147,7 @@ def steering(period: float = 1.0, ticks: int = 20, count: int = 300) -> Row:
 
 def run(most: int | None = None) -> list[Row]:
     """Rows. n(U) goes up to 10^6, or to DAGMAP_BENCH_MOST (10^7 takes minutes and 3 GB)."""
-    most = most or int(os.environ.get("DAGMAP_BENCH_MOST", 1_000_000))
+    most = most or int(os.environ.get("DAGMAP_BENCH_MOST", "1000000"))
     against_size(4000, 2)  # compiled and warm
     sizes = against_size(most, 2)
     degrees = [row for n_c in range(2, 9) for row in against_size(min(most, 100_000), n_c)[-1:]]
