@@ -105,7 +105,8 @@ $(DEMO)/bin/python $(TEST)/bin/python $(LOCK)/bin/python:
 	  $(PYTHON) -m pip --python $@ -qq install pip; fi
 
 lock: $(LOCK)/bin/uv
-	$(COMPILE) --extra fleet --extra rgbd --extra report --output-file requirements/demo.txt
+	$(COMPILE) --extra fleet --extra rgbd --extra report --extra view \
+	  --output-file requirements/demo.txt
 	$(COMPILE) --extra dev --constraint requirements/demo.txt --output-file requirements/test.txt
 	$(COMPILE) --extra fuzz --constraint requirements/test.txt --output-file requirements/fuzz.txt
 	@! grep -n '://' requirements/*.txt || { echo "An address in a lock file, see above" >&2; exit 1; }

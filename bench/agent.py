@@ -102,9 +102,9 @@ def late(count: int, thousand: int = 1000) -> list[dict[str, Any]]:
     for tx in transactions:
         consensus.add(tx)
     plain = _timed(consensus.advance)
-    latecomer = _chain(b"late one", len(transactions) // 2, 1)
+    latecomer = chain(b"late one", len(transactions) // 2, 1)
     one = _timed(lambda: [consensus.add(tx) for tx in latecomer], consensus.advance)
-    batch = _chain(b"late many", 1, thousand)
+    batch = chain(b"late many", 1, thousand)
 
     def one_by_one() -> None:
         for tx in batch:
@@ -121,7 +121,7 @@ def late(count: int, thousand: int = 1000) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
-def _chain(name: bytes, lamport: int, count: int) -> list[Any]:
+def chain(name: bytes, lamport: int, count: int) -> list[Any]:
     """Transactions of one author that claim Lamport times from `lamport` on."""
     robot = Agent(Identity.from_seed(name.ljust(32)), CONFIG)
     for cycle in cycles(CYCLE * count, seed=5)[:count]:

@@ -181,6 +181,11 @@ class Robot:
         assert self.code() is None, self.log
         return {}
 
+    def answer(self) -> dict[str, Any]:
+        """The status, however long a slow machine takes for it."""
+        status: dict[str, Any] = until(self.status, f"{self.name} to answer")
+        return status
+
     def signal(self, number: int) -> None:
         assert self.pid is not None
         with suppress(ProcessLookupError):
@@ -248,7 +253,8 @@ def running(*robots: Robot) -> Iterator[None]:
 def agreed(*robots: Robot, authors: int = 0) -> list[dict[str, Any]]:
     """The statuses, where all are done and hold one map of so many authors; else []."""
     answers = [robot.status() for robot in robots]
-    if not all(answers) or len({answer["digest"] for answer in answers}) > 1:
+    digests = {answer["digest"] for answer in answers if answer}
+    if not all(answers) or len(digests) > 1 or None in digests:
         return []
     for answer in answers:
         busy = answer["lag"]["to_issue"] or answer["lag"]["missing"]

@@ -55,7 +55,7 @@ def test_what_is_retracted_leaves_no_ray_either() -> None:
     fresh.add(other.make(payload=Payload(anchors=(anchor(0),), bundle=bundle(0, 3, 0))))
     fresh.add(other.make(payload=Payload(retracted=numbers)))
     assert consensus.digest() == fresh.digest()
-    component = next(iter(consensus._components.values()))
+    component = next(iter(consensus.folded.components.values()))
     passes, ends = component.rays.evidence(np.array([[0, 40, 80]], np.int32))
     assert passes.sum() == 0 and ends.sum() == 0
 

@@ -46,14 +46,14 @@ def test_costs_per_feature_are_found_whatever_the_size_of_the_map() -> None:
 def test_a_robot_that_costs_what_the_paper_says_is_understood(as_printed: bool) -> None:
     model, l_dist, l_search = Model(as_printed), 3e-9, 8e-9
     for i, work in enumerate(stories(60)):
-        size = Size(1000 + 50 * i, 4)
+        size = Size(1000 + 50 * i, 2)
         seconds = work.inserted * t_insertion(size, l_dist)  # Eq. (2)
         seconds += work.bundles * t_broadcast(size, l_search)
         seconds += work.merges * t_merge(size, l_dist, as_printed)
         model.add(work, size, seconds)
     assert model.l_dist == pytest.approx(l_dist, rel=0.02)
     assert model.l_search == pytest.approx(l_search, rel=0.2)
-    assert model.paper(stories(1)[0], Size(4000, 4)) > 0
+    assert model.paper(stories(1)[0], Size(4000, 2)) > 0
 
 
 def test_a_fit_follows_a_change_and_never_goes_below_nothing() -> None:

@@ -59,7 +59,7 @@ class TestAgreement:
             b.kill()
             b.start("--speed", 20)
             until(lambda: b.status().get("cycles") == 8 and agreed(a, b, authors=2), "agreement")
-            assert b.status()["author"] == author
+            assert b.answer()["author"] == author
             assert [a.stop(), b.stop()] == [0, 0]
         chain = a.restored().ledger.chain(b.identity().author)
         sessions = {anchor.session for tx in chain.main for anchor in tx.payload.anchors}
@@ -74,10 +74,10 @@ class TestAgreement:
         with running(*robots, c):
             a.start("--speed", 20)
             b.start("--speed", 20)
-            until(lambda: agreed(a, b, authors=2) and a.status()["cycles"] == 8, "a and b")
+            until(lambda: agreed(a, b, authors=2) and a.answer()["cycles"] == 8, "a and b")
             c.start()
             until(lambda: agreed(a, b, c, authors=2), "the late joiner")
-            assert c.status()["map"] == a.status()["map"]
+            assert c.answer()["map"] == a.answer()["map"]
 
     def test_ends_of_a_chain_that_never_meet(
         self, nursery: Nursery, tmp_path: Path, recordings: list[Path]
@@ -119,9 +119,9 @@ class TestAgreement:
             b.start("--speed", 4, "--wait-for", 1)
             until(lambda: b.status().get("cycles", 0) >= 2, "both to begin")
             proxy.cut()
-            until(lambda: all(r.status()["cycles"] == 8 for r in (a, b)), "both to end")
-            until(lambda: not any(r.status()["lag"]["to_issue"] for r in (a, b)))
-            apart = [robot.status() for robot in (a, b)]
+            until(lambda: all(r.answer()["cycles"] == 8 for r in (a, b)), "both to end")
+            until(lambda: not any(r.answer()["lag"]["to_issue"] for r in (a, b)))
+            apart = [robot.answer() for robot in (a, b)]
             assert apart[0]["digest"] != apart[1]["digest"]
             proxy.heal()
             together = until(lambda: agreed(a, b, authors=2), "agreement")
@@ -134,22 +134,24 @@ class TestAgreement:
     ) -> None:
         a = Robot(nursery, tmp_path, "a", record_much(tmp_path / "long.npz"))
         b = Robot(nursery, tmp_path, "b")
+        c = Robot(nursery, tmp_path, "c", connect=(a.port,))
         proxy = Proxy(b.port)
         a.connect = (proxy.port,)
         a.more = f"send_bytes = {1 << 16}"
-        with running(a, b):
+        with running(a, b, c):
             b.start()
-            until(b.status, "b")
-            a.start("--speed", 10, "--wait-for", 1)  # slow enough to be seen beginning
-            until(lambda: a.status().get("cycles", 0) >= 2, "a to begin")
+            who = until(b.status, "b")["author"]
+            a.start("--speed", 50, "--wait-for", 2)
+            until(lambda: a.answer()["peers"].get(who, {}).get("here"), "a to reach b")
             proxy.flowing.clear()
-            stalled = until(lambda: a.status()["cycles"] == 60 and a.status(), "a to end")
+            c.start()  # which a has waited for
+            stalled = until(lambda: a.answer()["cycles"] == 60 and a.answer(), "a to end")
             assert stalled["lag"]["unsent_bytes"] > 0 or stalled["traffic"]["dropped"]["sent"] > 0
-            assert b.status()["transactions"] < stalled["transactions"]
+            assert b.answer()["transactions"] < stalled["transactions"]
             if heals:
                 proxy.flowing.set()
                 until(lambda: agreed(a, b, authors=1), "agreement")
-                assert b.status()["transactions"] >= stalled["transactions"]
+                assert b.answer()["transactions"] >= stalled["transactions"]
             assert a.stop() == 0  # also while the link is stuck
         proxy.close()
 
@@ -223,7 +225,7 @@ class TestStrangers:
             other.start("--speed", 20)
             until(lambda: "make [fold], [transaction]" in a.log + other.log)
             until(lambda: "make [fold], [transaction]" in other.log and "make [fold]" in a.log)
-            assert len(a.status()["heads"]) == len(other.status()["heads"]) == 1
+            assert len(a.answer()["heads"]) == len(other.answer()["heads"]) == 1
 
 
 class TestStatus:
@@ -240,7 +242,7 @@ class TestStatus:
                 robot.start("--speed", 20)
             until(lambda: all(robot.status().get("cycles") == 8 for robot in robots))
             answers = until(lambda: agreed(a, b, authors=2), "agreement")
-            until(lambda: a.status()["peers"][answers[1]["author"]]["delay_ms"] is not None)
+            until(lambda: a.answer()["peers"][answers[1]["author"]]["delay_ms"] is not None)
             show_status(a.file, as_json=False)
             show_status(Path(a.socket), as_json=True)
         shown = capsys.readouterr().out

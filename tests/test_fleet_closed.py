@@ -172,7 +172,7 @@ class TestStrangers:
             assert stranger.hears() == [stranger.name]
             outcast = stranger.status()
             assert outcast["peers"] == {} and outcast["traffic"]["received"] == {}
-            assert outcast["author"] not in a.status()["peers"].keys() | b.status()["peers"].keys()
+            assert outcast["author"] not in a.answer()["peers"].keys() | b.answer()["peers"].keys()
             assert [robot.stop() for robot in (a, b, stranger)] == [0, 0, 0]
 
     def test_a_robot_that_shows_anothers_certificate_does_not_start(
@@ -206,7 +206,7 @@ class TestRevoked:
             (b.keys / "revocations" / "copy.tx").write_bytes(word.read_bytes()[:50])  # half a copy
             until(lambda: "event=refused" in b.log, "half a copy to be looked at")
             shutil.copy(word, b.keys / "revocations" / "copy.tx")
-            until(lambda: all(r.status()["heads"][author]["length"] == 2 for r in robots), "word")
+            until(lambda: all(r.answer()["heads"][author]["length"] == 2 for r in robots), "word")
             after = until(lambda: agreed(*robots, authors=3), "agreement")
             assert after[0]["digest"] != before[0]["digest"]
             assert all("event=revoked" in robot.log for robot in robots)
@@ -218,11 +218,11 @@ class TestRevoked:
             until(lambda: lost.status().get("cycles") == 8 and agreed(*robots), "the rerun")
             two_announcements()
             assert (
-                len({robot.status()["digest"] for robot in (*robots,)} | {after[0]["digest"]}) == 1
+                len({robot.answer()["digest"] for robot in (*robots,)} | {after[0]["digest"]}) == 1
             )
-            assert lost.status()["transactions"] == held
+            assert lost.answer()["transactions"] == held
             newcomer = enroll(nursery, fleet, "newcomer", None, b)
             with running(newcomer):
                 newcomer.start()
                 until(lambda: agreed(*robots, newcomer), "a newcomer that learns of it")
-                assert newcomer.status()["digest"] == after[0]["digest"]
+                assert newcomer.answer()["digest"] == after[0]["digest"]

@@ -116,11 +116,11 @@ class TestDisk:
             assert "ledger.db: cannot be written: " in b.log.splitlines()[-1]
             assert "Traceback" not in b.log
             theirs = b.identity().author.hex()
-            until(lambda: a.status()["cycles"] == 60, "a to end")
-            told = a.status()["heads"][theirs]["length"]
+            until(lambda: a.answer()["cycles"] == 60, "a to end")
+            told = a.answer()["heads"][theirs]["length"]
             b.start("--speed", 50)  # the disk has room again: it goes on where it was
             until(lambda: b.status().get("cycles") == 60 and agreed(a, b, authors=2), "agreement")
-            head = a.status()["heads"][theirs]
+            head = a.answer()["heads"][theirs]
             assert head["length"] > told > 0 and head["forked_at"] is None
 
     def test_a_read_only_folder(self, nursery: Nursery) -> None:
@@ -143,7 +143,7 @@ class TestDisk:
             for run in range(3):
                 a.start("--speed", 20, "--wait-for", 1)
                 until(lambda: a.status().get("cycles") == 8 and agreed(a, b, authors=1), "a and b")
-                head = b.status()["heads"][a.identity().author.hex()]
+                head = b.answer()["heads"][a.identity().author.hex()]
                 assert head["forked_at"] is None
                 lengths.append(head["length"])
                 assert a.stop() == 0
@@ -217,7 +217,7 @@ class TestMistakes:
             robot.start()
             until(robot.status)
             self._refused(second, "ledger.db: cannot be opened: another process")
-            assert robot.status()  # which goes on
+            assert robot.answer()  # which goes on
 
     def test_parameters_under_which_the_ledger_does_not_hold(
         self, nursery: Nursery, tmp_path: Path

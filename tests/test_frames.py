@@ -18,6 +18,11 @@ from scene import pose
 A, B, C, D = (FrameId(bytes([n]) * 8) for n in (1, 2, 3, 4))
 
 
+def both(source: FrameId, target: FrameId, inliers: int, x: float = 0.0) -> list[Link]:
+    """What both ends say, alike."""
+    return [link(source, target, inliers, x), link(target, source, inliers, -x)]
+
+
 def link(source: FrameId, target: FrameId, inliers: int, x: float = 0.0, yaw: float = 0.0) -> Link:
     return Link(source, target, quantise_pose(pose(x, 0, 0, yaw)), inliers)
 
@@ -31,15 +36,15 @@ def test_the_lowest_author_is_the_origin() -> None:
 
 
 def test_components_stay_apart_until_a_link_joins_them() -> None:
-    links = [link(B, A, 5), link(D, C, 5)]
+    links = [*both(B, A, 5), *both(D, C, 5)]
     placed = place_frames(links)
     assert placed[B][0] == A and placed[D][0] == C
-    joined = place_frames([*links, link(C, B, 1, 3.0)])
+    joined = place_frames([*links, *both(C, B, 1, 3.0)])
     assert joined[D][0] == A and joined[D][1][4] == 3000
 
 
 def test_the_tree_takes_the_best_links() -> None:
-    links = [link(B, A, 9, 1.0), link(C, A, 2, 100.0), link(C, B, 8, 1.0)]
+    links = [*both(B, A, 9, 1.0), *both(C, A, 2, 100.0), *both(C, B, 8, 1.0)]
     assert place_frames(links)[C][1][4] == 2000
 
 

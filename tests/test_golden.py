@@ -30,6 +30,7 @@ from dagmap.model import FLEET_FRAME, FrameId, quantise_pose
 from dagmap.payload import (
     Anchor,
     Bundle,
+    Described,
     Kind,
     Link,
     Payload,
@@ -63,6 +64,12 @@ def bundle() -> Bundle:
     )
 
 
+def described() -> Described:
+    """Two points of cycle 300 with a descriptor each."""
+    position = np.array([[1000, -2000, 3000], [0, 0, 40]], np.int32)
+    return Described(300, position, np.arange(64, dtype=np.uint8).reshape(2, 32))
+
+
 PAYLOADS = {
     Kind.PROFILE: Payload(name="drone ä"),
     Kind.ANCHORS: Payload(anchors=(Anchor(300, 1, -1_500_000, pose()),)),
@@ -72,6 +79,7 @@ PAYLOADS = {
     Kind.LINK: Payload(links=(Link(FrameId(b"abcdefgh", 2), FLEET_FRAME, pose(), 200),)),
     Kind.CERTIFICATE: Payload(certificate=enrolled("r", CLOSED).certificate),
     Kind.REVOCATION: Payload(revocations=(Revocation(b"abcdefgh", 300),)),
+    Kind.DESCRIPTORS: Payload(described=(described(),)),
 }
 RECORDS: dict[Kind, str] = {
     Kind.PROFILE: "010864726f6e6520c3a4",
@@ -88,6 +96,11 @@ RECORDS: dict[Kind, str] = {
         "41d77d3bab7b1660ce9b27767ad4987d74771652b15c3ba749b508"
     ),
     Kind.REVOCATION: "080a6162636465666768ac02",
+    Kind.DESCRIPTORS: (
+        "095aac02e803000030f8ffffb80b0000000102030405060708090a0b0c0d0e0f1011121314151617"
+        "18191a1b1c1d1e1f000000000000000028000000202122232425262728292a2b2c2d2e2f30313233"
+        "3435363738393a3b3c3d3e3f"
+    ),
 }
 
 

@@ -91,6 +91,45 @@ def test_three_robots_map_one_office(office: tuple[Path, dict]) -> None:
     assert summary["bytes_per_feature"] == pytest.approx(sent / issued)
 
 
+def test_robots_of_the_office_find_each_others_frames(tmp_path: Path) -> None:
+    """Each starts at its own identity: the recorded poses are the truth, their frames the test."""
+    from dagmap.io.sources import open_source
+    from dagmap.model import FrameId, pose_matrix
+
+    paths = []
+    starts = {}
+    for i, folder in enumerate(sorted(OFFICE.glob("robot?"))):
+        seen = list(open_source(folder))
+        starts[folder.name] = back = np.linalg.inv(np.asarray(seen[0].pose))
+        paths.append(tmp_path / f"{folder.name}.npz")
+        save_cycles(paths[i], (replace(c, pose=back @ np.asarray(c.pose)) for c in seen))
+    run = dagmap("replay", *paths, "--out", tmp_path / "out", "--unknown-frames", "--json")
+    assert run.returncode == 0, run.stderr
+    summary = json.loads(run.stdout)
+    assert summary["converged"] and summary["map"]["confirmed"] > 500
+    assert all(robot["placed"] and not robot["unplaced"] for robot in summary["robots"])
+    with Store.open(tmp_path / "out" / "ledgers" / "robot1.db") as store:
+        held = Agent.restore(Identity.from_seed(bytes(32)), Config(start_pose=None), list(store))
+    assert held.digest().hex() == summary["digest"]
+    authors = {a.name: a for a in held.consensus.authors.values()}
+    frames = held.consensus.frames
+    poses = {name: pose_matrix(frames[FrameId(a.id)][1]) for name, a in authors.items()}
+
+    for one, other in (("robot1", "robot2"), ("robot2", "robot3"), ("robot1", "robot3")):
+        truth = starts[other] @ np.linalg.inv(starts[one])
+        off = np.linalg.inv(truth) @ np.linalg.inv(poses[other]) @ poses[one]
+        walked = [pose_matrix(a.pose)[:3, 3] for a in authors[one].anchors.values()]
+        metres = np.linalg.norm(walked @ off[:3, :3].T + off[:3, 3] - walked, axis=1)
+        degrees = np.degrees(np.arccos(np.clip((np.trace(off[:3, :3]) - 1) / 2, -1, 1)))
+        assert metres.mean() < 0.03 and degrees < 1.0
+
+
+def test_robots_that_share_nothing_are_told_apart(streams: list[Path], tmp_path: Path) -> None:
+    run = dagmap("replay", *streams[:2], "--out", tmp_path / "out", "--unknown-frames")
+    assert run.returncode == 0, run.stderr
+    assert "red does not know where green is: no described points came yet" in run.stdout
+
+
 def test_the_map_is_where_the_office_is(office: tuple[Path, dict]) -> None:
     """Nodes of the map lie on what the depth images of other frames show."""
     from scipy.spatial import cKDTree

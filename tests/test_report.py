@@ -104,7 +104,7 @@ def test_robots_that_disagree_are_not_called_converged(tmp_path: Path) -> None:
 
 def test_whatever_else_was_measured_is_listed(tmp_path: Path) -> None:
     more = {"loss": 0.1, "late": {"robot": "cleo", "undone": 12}, "left": ["ada", "bob"]}
-    told = {"versions": {"numpy": "told elsewhere"}, "parameters": {"v_th": "told elsewhere"}}
+    told = {"versions": {"numpy": "told elsewhere"}}
     page = report(tmp_path, summary(**more, **told, nothing=None, nobody=[]))
     assert "loss|0.1|" in page.text
     assert "late.robot|cleo|" in page.text
@@ -131,3 +131,67 @@ def test_a_figure_that_is_missing_is_named(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"maps\.png: .*cannot be read"):
         write_report(tmp_path / "report.html", summary(), [tmp_path / "maps.png"], "", {})
     assert list(tmp_path.iterdir()) == []
+
+
+def rows(page: Page, table: str) -> list[list[str]]:
+    """The cells of the table under a heading of the page."""
+    text = page.text.split(f"|{table}|")[1]
+    cells = [cell.strip() for cell in text.split("|") if cell.strip()]
+    columns = cells.index("ada")
+    return [cells[i : i + columns] for i in range(0, 4 * columns, columns)]
+
+
+def test_agreement_names_who_holds_another_map(tmp_path: Path) -> None:
+    changed = summary()
+    changed["robots"][1]["digest"] = "77" * 32
+    table = rows(report(tmp_path, changed), "Agreement")
+    assert table[:3] == [
+        ["Robot", "The same map", "Digest"],
+        ["ada", "yes", "5a" * 32],
+        ["bob", "NO", "77" * 32],
+    ]
+
+
+def test_traffic_of_each_robot_and_of_all(tmp_path: Path) -> None:
+    changed = summary()
+    changed["robots"][1] |= {"bytes_sent": 1000, "features_issued": 500, "features_observed": 707}
+    table = rows(report(tmp_path, changed), "Traffic of the robots")
+    assert table == [
+        ["Robot", "Bytes sent", "Bytes received", "Bytes per feature", "Features sent"],
+        ["ada", "71,234", "140,000", "7.21", "69.1 %"],
+        ["bob", "1,000", "140,000", "2", "70.7 %"],
+        ["All", "72,234", "280,000", "6.96", "69.2 %"],
+    ]
+
+
+def test_parameters_are_a_table_where_the_summary_has_them(tmp_path: Path) -> None:
+    told = {"fleet": "office", "graph": {"v_th": 8, "n_p": 2}, "path": None, "pose": [1.0, 0.5]}
+    page = report(tmp_path, summary(parameters=told))
+    for row in ("fleet|office|", "graph.v_th|8|", "graph.n_p|2|", "pose|1.0, 0.5|"):
+        assert row in page.text
+    assert "v_th = 8" not in page.text
+
+
+def test_every_section_is_there_for_a_phone_and_for_paper(tmp_path: Path) -> None:
+    page = report(tmp_path, summary())
+    headings = re.findall("<h2>(.*?)</h2>", (tmp_path / "report.html").read_text("utf-8"))
+    assert headings == [
+        *("Maps", "Traffic", "Robots", "Map", "Traffic of the robots", "Agreement"),
+        *("Parameters", "Versions"),
+    ]
+    cells = [attrs for tag, attrs in page.tags if tag == "td"]
+    assert cells and all(attrs.get("data-label") for attrs in cells)  # a narrow screen shows them
+    viewport = {attrs.get("name"): attrs.get("content") for tag, attrs in page.tags}
+    assert viewport["viewport"] == "width=device-width, initial-scale=1"
+    css = (tmp_path / "report.html").read_text("utf-8").split("</style>")[0]
+    assert "@media print" in css and "@media screen and (max-width" in css
+    assert not re.search(r"url\(|@import", css)
+
+
+def test_names_cannot_leave_an_attribute(tmp_path: Path) -> None:
+    changed = summary()
+    changed["robots"][0]["name"] = '"><script>alert(1)</script>'
+    changed['x" onclick="alert(1)'] = 1
+    page = report(tmp_path, changed)
+    assert "script" not in {tag for tag, _ in page.tags}
+    assert all("onclick" not in attrs for _, attrs in page.tags)

@@ -163,3 +163,28 @@ def test_signed_numbers_come_back(value: int) -> None:
 def test_numbers_have_one_form(data: bytes) -> None:
     with pytest.raises(Refusal):
         Reader(data).number()
+
+
+@given(
+    values=st.lists(st.integers(0, 127) | st.integers(0, (1 << 40) - 1), max_size=30),
+    harm=st.lists(st.tuples(st.integers(0, 200), st.integers(0, 255)), max_size=3),
+)
+def test_many_numbers_are_read_and_written_as_one_after_the_other(
+    values: list[int], harm: list[tuple[int, int]]
+) -> None:
+    data = wire.numbers(np.array(values, np.int64))
+    assert data == b"".join(map(wire.number, values))
+    harmed = bytearray(data + b"\x05")
+    for at, byte in harm:
+        harmed[at % len(harmed)] = byte
+
+    def read(many: bool) -> tuple[list[int], int] | Reason:
+        reader = wire.Reader(bytes(harmed))
+        try:
+            if many:
+                return reader.numbers(len(values), 1 << 40).tolist(), reader.left
+            return [reader.number(1 << 40) for _ in values], reader.left
+        except wire.Refusal as refusal:
+            return refusal.reason
+
+    assert read(many=True) == read(many=False)

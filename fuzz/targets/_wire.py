@@ -16,7 +16,7 @@ from dagmap import identity, messages, payload, transaction
 from dagmap.config import Config, GraphConfig, TransactionConfig
 from dagmap.identity import Identity
 from dagmap.model import FLEET_FRAME, LIMIT_MM, FrameId, quantise_pose
-from dagmap.payload import Anchor, Bundle, Kind, Link, Payload, Revocation, Sighting
+from dagmap.payload import Anchor, Bundle, Described, Kind, Link, Payload, Revocation, Sighting
 from dagmap.transaction import id_of
 from dagmap.wire import Reader, Refusal
 from grammar import (
@@ -85,6 +85,7 @@ RECORDS: dict[int, Grammar] = {
     Kind.LINK: record(_FRAME, _FRAME, raw(28), number),
     Kind.CERTIFICATE: _certificate,
     Kind.REVOCATION: record(raw(8), number),
+    Kind.DESCRIPTORS: record(number, many(raw(44))),
 }
 _SIZED = {int(kind): sized(grammar) for kind, grammar in RECORDS.items()}
 PAYLOAD = many(record(number, by_kind(_SIZED, sized(rest))))
@@ -163,7 +164,14 @@ def payloads() -> list[Payload]:
         Payload("all", anchors, bundle(Random(3), 5, 1), numbers[:1], seen[:1], links[:1]),
         Payload(certificate=ROBOTS[0].certificate, anchors=anchors[:1], links=links),
         Payload(revocations=(Revocation(ROBOTS[1].author, 1), Revocation(ROBOTS[2].author, 0))),
+        Payload(anchors=anchors, described=(_described(1), _described(5))),
     ]
+
+
+def _described(count: int) -> Described:
+    rng = np.random.default_rng(count)
+    position = rng.integers(-3000, 3000, (count, 3)).astype(np.int32)
+    return Described(3, position, rng.integers(0, 256, (count, 32)).astype(np.uint8))
 
 
 def bundle(rng: Random, count: int, segments: int, base: int = 40, n_p: int = 2) -> Bundle:

@@ -19,8 +19,8 @@ from targets._wire import AUTHORITY, CLOSED, ROBOTS, TRANSACTION, change, payloa
 from targets.envelope import ENCODERS, check
 
 _ORDER = (  # the cheap checks first, none twice
-    "first_certificate",
     "_work_holds",
+    "first_certificate",
     "certificate_holds",
     "signature_holds",
     "decode_payload",

@@ -15,7 +15,7 @@ from . import checkpoint as checkpoints
 from . import messages
 from .config import Config
 from .consensus import Consensus
-from .identity import Identity, certificate_holds
+from .identity import Identity, check_certificate
 from .ledger import Ledger
 from .messages import Heads, Message, Transactions
 from .model import (
@@ -23,7 +23,6 @@ from .model import (
     Accepted,
     AuthorId,
     Bools,
-    ConfigError,
     Cycle,
     Event,
     Floats,
@@ -41,6 +40,7 @@ from .model import (
     quantise_cycle,
 )
 from .observing import Observing
+from .placing import Placing
 from .shaping import Urgency
 from .steering import Steering
 from .sync import Sync
@@ -70,13 +70,16 @@ class Agent:
         self.config = config or Config()
         self._parsers = parsers or Parsers()
         self.identity = identity
-        _check_certificate(identity, self.config)
+        check_certificate(identity, self.config)
         self.ledger = Ledger(self.config)
         self.consensus = Consensus(self.config, identity.salt)
         self.observing = Observing(self.config, identity.author, identity.salt)
         self.sync = Sync(self.ledger, self.config, identity.author)
+        self.placing = Placing(self.config.placing, identity.author)
         self.steering = Steering(self.config, identity.author)
         self._map: WorldMap | None = None
+        self._map_version = -1  # of the consensus, when the map was made
+        self._undone = self._applied = 0  # transactions, since the last `MapChanged`
 
     @classmethod
     def restore(
@@ -107,14 +110,19 @@ class Agent:
         self.observing.resume(self.ledger.chain(self.identity.author).main)
 
     def checkpoint(self, stored: Sequence[TransactionId]) -> bytes:
-        """The folded state. stored: ids of all accepted transactions, in the order of the store."""
-        self._advance()
+        """The folded state. stored: ids of all accepted transactions, in the order of the store.
+
+        Undo records that lie far behind it are dropped (`ledger.undo_kept`).
+        """
+        self.settle()
+        self.consensus.drop_records()
         return checkpoints.save(self.ledger, self.consensus, self.identity, stored)
 
     def observe(self, cycle: Cycle, now: float) -> list[Event]:
         """Take one cycle of the local SLAM. Raises CycleError, and then nothing was taken."""
         quantised = self.observing.check(quantise_cycle(cycle))
         self.observing.withdraw(quantised)  # what the SLAM removed or moved
+        self.observing.rearrange()
         # what it added: Alg. 1
         events = self.steering.insert(self.observing, quantised, now, self._settled)
         events += self._issue(now)
@@ -147,15 +155,17 @@ class Agent:
         return self._through_the_door(bytes(data))
 
     def tick(self, now: float, unread: bool = False) -> list[Event]:
-        """Let time pass: release what the pacing held back, fold, announce, repair.
+        """Let time pass: release what the pacing held back, fold, place, announce, repair.
 
         unread: whether messages have come that were not handed in yet. What is overdue may be
         among them, so it is asked for again much later.
         """
+        self.observing.rearrange()
         self.steering.look(self.sync, now)
         events = self.steering.catch_up(self.observing, now, self._settled)
         events += self._issue(now)
         events += self._advance(self.config.ledger.fold_per_tick)
+        self.observing.relate(*self.placing.step(self.ledger, self.consensus))
         self.steering.announce(self.sync.tick(now, unread), now)
         self.steering.shaper.release(now)
         return events
@@ -172,14 +182,29 @@ class Agent:
         return self.steering.shaper.take()
 
     def digest(self) -> bytes:
-        """32 bytes that are equal on two robots exactly when their maps are."""
-        self._advance()
+        """32 bytes over the map of all that is accepted; equal on two robots exactly when their
+        maps are. Settles first."""
+        self.settle()
         return self.consensus.digest()
+
+    @property
+    def settled(self) -> bool:
+        """Whether all that is accepted is folded: then `map` is the map that `digest` is of."""
+        return not self.consensus.pending
+
+    def settle(self) -> None:
+        """Fold to the end, however long it takes; ticks do it in bounded steps."""
+        self._advance()
 
     @property
     def holds_back(self) -> bool:
         """Whether something that is valid still waits to be issued (the next ticks do it)."""
         return (self.observing.waiting or self.steering.shaper.waiting) and not self._silenced
+
+    @property
+    def searching(self) -> bool:
+        """Whether the last tick compared keyframes: the frames may be placed anew soon."""
+        return self.placing.busy
 
     @property
     def _silenced(self) -> bool:
@@ -189,22 +214,28 @@ class Agent:
 
     @property
     def map(self) -> WorldMap:
-        """The map of the robot's own component of frames, up to date and immutable."""
-        self._advance()
-        if self._map is None:
-            self._map = build_map(self.consensus, self._component, self.config.fold.cell)
+        """The map of the robot's own component of frames, immutable.
+
+        It is up to date but for a revision that takes longer than a tick: as long as one is under
+        way (see `settled`), this is the map before it.
+        """
+        self._catch_up()
+        if self._map is None or not self._pictured:
+            picture = self.consensus.picture(self._component)
+            self._map = build_map(picture, self.config.fold.cell)
+            self._map_version = self.consensus.version
         return self._map
 
     def frame(self) -> Floats | None:
         """(4, 4) pose of the robot's SLAM frame in the fleet frame; None while not placed."""
-        self._advance()
+        self._catch_up()
         placed = self.consensus.frames.get(FrameId(*self._frame))
         return None if placed is None else pose_matrix(placed[1])
 
     @property
     def robots(self) -> dict[str, tuple[Floats, float]]:
         """Newest pose (4, 4) in this robot's component, and its stamp in s, by robot's name."""
-        self._advance()
+        self._catch_up()
         here, found = self._component, {}
         for author in sorted(self.consensus.authors.values(), key=lambda author: author.id):
             if author.anchors:
@@ -217,10 +248,16 @@ class Agent:
         return found
 
     @property
+    def unplaced(self) -> dict[FrameId, str]:
+        """SLAM frames that no links lead to from this robot's, and why: they wait, unmerged."""
+        self._advance()
+        return self.placing.why(self.consensus)
+
+    @property
     def _component(self) -> FrameId:
         """Where this robot is; before its first cycle, where it is configured to start."""
         if FrameId(*self._frame) not in self.consensus.frames and not self.observing.cycles:
-            return FLEET_FRAME if self.config.start_pose is not None else FrameId(*self._frame)
+            return FLEET_FRAME if self.config.start_pose else FrameId(*self._frame)
         return self.consensus.placement(*self._frame)[0]
 
     @property
@@ -313,7 +350,6 @@ class Agent:
             self.consensus.add(tx)
         else:
             tx.drop_columns()
-        self._map = None
 
     def _refold(self, author: AuthorId) -> None:
         """A revocation came, or counts no more: fold exactly what counts of the author now."""
@@ -323,36 +359,30 @@ class Agent:
             if tx not in self.consensus and self.ledger.counts(tx):
                 tx.payload = tx.decode_again(self.config)
                 self.consensus.add(tx)
-        self._map = None
 
     def _advance(self, budget: int | None = None) -> list[Event]:
+        """Fold on. What a revision does is told of at its end, as one change."""
         if not self.consensus.pending:
             return []
-        self._map = None
-        return [MapChanged(*self.consensus.advance(budget))]
+        keep = None if self._pictured else self._component
+        version = self.consensus.version
+        undone, applied = self.consensus.advance(budget, keep)
+        self._undone, self._applied = self._undone + undone, self._applied + applied
+        if self.consensus.version == version:
+            return []
+        event = MapChanged(self._undone, self._applied)
+        self._undone = self._applied = 0
+        return [event]
 
+    def _catch_up(self) -> None:
+        """Fold to the end what needs no long revision; a revision is left to the ticks."""
+        while self.consensus.pending and not self.consensus.revising:
+            self._advance(self.config.ledger.fold_per_tick)
 
-def _check_certificate(identity: Identity, config: Config) -> None:
-    """In a closed fleet a robot without its certificate would be heard by nobody."""
-    certificate, remedy = identity.certificate, "enroll the robot (dagmap keys enroll)"
-    if not config.closed:
-        return
-    if certificate is None:
-        raise ConfigError(
-            f"Config: fleet_key closes the fleet {config.fleet!r}, but {identity} has no "
-            f"certificate; {remedy} and load its folder"
-        )
-    holds = certificate_holds(
-        certificate, config.fleet_public_key, config.fleet_id, identity.public_key
-    )
-    if not holds:
-        raise ConfigError(
-            f"Config: the certificate of {identity} is not one of the fleet {config.fleet!r} with "
-            f"fleet_key = {config.fleet_key!r}; {remedy} in that fleet, or correct both keys"
-        )
-    name = identity.name
-    if config.name not in ("", name):
-        raise ConfigError(
-            f"Config: name = {config.name!r}, but the certificate names the robot {name!r}; "
-            "leave the name out"
-        )
+    @property
+    def _pictured(self) -> bool:
+        """Whether the map is that of what is folded (in a revision: was, before it)."""
+        consensus = self.consensus
+        if self._map is None or self._map_version != consensus.version:
+            return False
+        return consensus.revising or self._map.origin == self._component

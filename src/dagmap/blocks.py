@@ -86,6 +86,10 @@ class Fold(Protocol):
     def undo(self, block: Block) -> None:
         """The exact inverse: `block` is the last one applied and not yet undone."""
 
+    def drop_records(self, keep: int) -> None:
+        """Drop all but the last `keep` rows of what undoing needs: a block has one row for itself
+        and one for each feature and sighting. What has none left cannot be undone."""
+
     def feature_nodes(self, author: int) -> Int32s:
         """(F,) node of each feature number of an author, -1 where there is none; read-only."""
 
@@ -143,6 +147,11 @@ class Features:
         """Forget the last block."""
         self._lengths[block.author] = int(self.undo[self.top - 1])
         self.top -= len(block.xyz) + len(block.sightings) + 1
+
+    def drop(self, keep: int) -> None:
+        """Drop all but the last `keep` rows of the undo records."""
+        self.undo = self.undo[self.top - keep : self.top].copy()
+        self.top = keep
 
     def of(self, author: int) -> Int32s:
         nodes = self._nodes.get(author, np.zeros(0, np.int32))

@@ -13,7 +13,15 @@ from typing import Literal, TypeVar
 
 import msgspec
 
-from .model import LIMIT_MM, MAX_NAME, ConfigError, CycleError, quantise_pose
+from .model import (
+    LIMIT_MM,
+    MAX_DESCRIBED,
+    MAX_KEYFRAMES,
+    MAX_NAME,
+    ConfigError,
+    CycleError,
+    quantise_pose,
+)
 
 
 class _Checked(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -148,11 +156,15 @@ class LedgerConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     waiting_transactions: int = 4096  # the waiting room: transactions without their references
     waiting_bytes: int = 64 << 20
-    fold_per_tick: int = 100_000  # features that a tick folds at most; a read folds the rest
+    # Observations whose folding can be undone after a checkpoint, at 4 bytes each. What comes from
+    # before them costs a fold of everything, half of which it would cost anyway.
+    undo_kept: int = 1_000_000
+    fold_per_tick: int = 25_000  # work of a tick, in features folded; a unit is about 1 us
 
     def __post_init__(self) -> None:
         self._require_range("waiting_transactions", 1, 1 << 24)
         self._require_range("waiting_bytes", 1 << 16, 1 << 40)
+        self._require_range("undo_kept", 0, 1 << 40)
         self._require_range("fold_per_tick", 1, 1 << 40)
 
 
@@ -192,6 +204,34 @@ class OverheadConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=
         return not (self.fleet_bytes_per_second is None and self.robot_bytes_per_second is None)
 
 
+class PlacingConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How robots that share no frame find each other's. A robot's own policy, see docs/placing.md.
+
+    Lengths follow the sensor: `tolerance` is how far apart two robots may see one point.
+    """
+
+    tolerance: float = 0.08  # m: about four times the noise of a depth camera at 3 m
+    points: int = 200  # described points of a keyframe that are sent, the first of the cycle
+    keyframes: int = 100  # of a session, at most
+    keyframe_distance: float = 0.3  # m between keyframes that look the same way
+    keyframe_turn: float = 15.0  # degrees between keyframes of one place
+    inliers: int = 30  # points that must agree before a link is published
+    units_per_tick: int = 12  # pairs of keyframes that a tick compares, about half a ms each
+
+    def __post_init__(self) -> None:
+        self._require_range("tolerance", 0.005, 10.0)
+        self._require_range("points", 3, MAX_DESCRIBED)
+        self._require_range("keyframes", 0, MAX_KEYFRAMES)
+        self._require_range("keyframe_distance", 0.01, 1000.0)
+        self._require_range("keyframe_turn", 1.0, 180.0)
+        self._require_range("inliers", 12, 1 << 20)
+        self._require_range("units_per_tick", 1, 10_000)
+
+    @property
+    def tolerance_mm(self) -> int:
+        return round(self.tolerance * 1000)
+
+
 class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All parameters of one participant.
 
@@ -202,7 +242,7 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     name: what people call this robot; empty: the hexadecimal author id. In a closed fleet the
         certificate names it.
     start_pose: (4, 4) rows of the robot's first SLAM frame in the fleet frame, metres, published as
-        a link; default identity: the robots share one frame. None: unknown.
+        a link; default identity: the robots share one frame. None, or [] in a file: unknown.
     same_origin: whether a new session of the SLAM starts in the frame of the one before.
     """
 
@@ -222,6 +262,7 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     fold: FoldConfig = FoldConfig()
     ledger: LedgerConfig = LedgerConfig()
     sync: SyncConfig = SyncConfig()
+    placing: PlacingConfig = PlacingConfig()
     overhead: OverheadConfig = OverheadConfig()
 
     def __post_init__(self) -> None:
@@ -233,7 +274,7 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
             "fleet_key",
             "the 64 lower case hexadecimal digits are wanted that stand in the fleet's fleet.toml",
         )
-        if self.start_pose is not None:
+        if self.start_pose:
             try:
                 quantise_pose(self.start_pose, "Config: start_pose")
             except CycleError as error:

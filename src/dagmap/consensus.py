@@ -3,7 +3,9 @@
 The fold takes transactions in canonical order. What sorts before something already applied, or
 changes what was applied (a moved anchor, a retraction, a new link, a proven fork), only leaves a
 mark; `advance` then undoes down to the lowest mark and applies up again, once for all of them.
-Ray evidence commutes, so it stays outside the undo: a contribution that changes walks again.
+That is a revision. It may take many calls: then a copy of what was folded is there to be read
+meanwhile, and what comes once the undoing is over waits for the next one, so that every revision
+ends. Ray evidence commutes, so it stays outside the undo: what changes walks again.
 """
 
 from __future__ import annotations
@@ -11,29 +13,41 @@ from __future__ import annotations
 import hashlib
 from bisect import insort
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from .config import Config
 from .contribution import Author, Contribution, Key, Placement
-from .fold import DefaultFold, Fold, NodeColumns, RayEvidence, Verdict, make_fold
+from .folded import TRANSACTION, Copying, Folded, Picture, frame_bytes
 from .frames import IDENTITY_POSE, place_frames
 from .kernels.geometry import apply_pose
 from .model import AuthorId, Bools, FrameId, Int32s
 from .payload import Anchor
 from .transaction import Transaction
 
+MAX_SESSIONS = 256  # of one author that others look for; its features count in any case
 MAX_LINKS = 256  # of one author, the first in its chain: bounds what placing frames costs
 
 
-@dataclass(slots=True)
-class Component:
-    """The nodes and the ray evidence of one connected component of frames."""
+class _Cut(NamedTuple):
+    """Of an author, nothing from this number on counts."""
 
-    fold: Fold
-    rays: RayEvidence
-    verdict: Verdict | None = None  # of the nodes as they are, once it was asked for
+    author: AuthorId
+    sequence: int
+
+
+class _Work:
+    """Counts units of work (see `folded`) against a budget."""
+
+    def __init__(self, budget: int | None) -> None:
+        self.left = float("inf") if budget is None else budget
+        self.bounded = budget is not None
+        self.undone = self.applied = 0  # transactions
+
+    @property
+    def over(self) -> bool:
+        return self.left <= 0
 
 
 class Consensus:
@@ -43,19 +57,27 @@ class Consensus:
         self._config, self._salt = config, salt
         self.authors: dict[AuthorId, Author] = {}
         self.frames: dict[FrameId, Placement] = {}
-        self._components: dict[FrameId, Component] = {}
+        self.revising = False  # something was undone that is not applied again
+        self.version = 0  # of what is folded; it stays as it is in a revision
+        self.folded = Folded(config.fold, salt)  # a prefix of the order, once unmarked
         self._order: list[Key] = []
         self._contributions: dict[Key, Contribution] = {}
-        self._applied: list[Key] = []  # what is in the folds: a prefix of the order, once unmarked
+        self._members: set[Key] = set()  # those of the order, and of what waits
         self._mark: Key | None = None  # from this key on nothing is applied as it should be
         self._stale: set[Key] = set()  # to be placed (again) before they are applied
+        self._gone: list[Contribution] = []  # cut; their rays are still to be taken back
         self._links_changed = False
+        self._upwards = False  # the revision undoes no more
+        self._late: list[Transaction | _Cut] = []  # waits for the end of a revision
+        self._copying: Copying | None = None
+        self._kept: Picture | None = None
 
     @property
     def pending(self) -> bool:
         """Whether `advance` has something to do."""
-        behind = len(self._applied) < len(self._order)
-        return behind or self._mark is not None or self._links_changed
+        behind = len(self.folded.applied) < len(self._order)
+        marked = self._mark is not None or self._links_changed or bool(self._gone)
+        return behind or marked or self.revising or bool(self._late)
 
     def author(self, id_: AuthorId) -> Author:
         """What is known of an author; a new one gets the next local index."""
@@ -67,107 +89,196 @@ class Consensus:
         return (self._contributions[key] for key in self._order)
 
     def __contains__(self, tx: Transaction) -> bool:
-        return tx.key in self._contributions
+        return tx.key in self._members
 
     def add(self, tx: Transaction) -> None:
         """Take a transaction that counts. Per author they come in sequence."""
-        contribution = Contribution(tx, self.author(tx.author), self._config)
-        self._contributions[tx.key] = contribution
-        insort(self._order, tx.key)
-        self._restale((tx.key,))
-        self._note(contribution)
-        tx.drop_columns()
+        self._members.add(tx.key)
+        self._take(tx)
 
     def cut(self, id_: AuthorId, sequence: int) -> None:
         """Leave out everything of an author from `sequence` on: a fork, or a revocation."""
-        mine = [key for key in self._order if key[1] == id_]
-        gone = [key for key in mine if key[2] >= sequence]
-        if not gone:
-            return
-        self._restale(mine)
-        self._undo()
-        for key in gone:
-            self._walk(self._contributions.pop(key), -1)
-            self._stale.discard(key)
-            self._order.remove(key)
-        self.authors[id_] = Author(id_, self.authors[id_].index)
-        self._links_changed = True
-        for key in mine[: len(mine) - len(gone)]:
-            self._contributions[key].author = self.authors[id_]
-            self._note(self._contributions[key])
+        self._members -= {k for k in self._members if k[1] == id_ and k[2] >= sequence}
+        self._take(_Cut(id_, sequence))
 
-    def advance(self, budget: int | None = None) -> tuple[int, int]:
-        """Undo and apply until the fold is that of the set, or `budget` features are applied.
+    def advance(self, budget: int | None = None, keep: FrameId | None = None) -> tuple[int, int]:
+        """Undo and apply until the fold is that of the set, or the budget is used up.
 
+        budget: units of work, about the folding of one feature each; a step that has begun is
+            ended. With a budget, what follows a revision is left to the next call.
+        keep: component of which `picture` is to give what was folded before, should a revision
+            begin that the budget does not suffice for.
         Returns how many transactions were undone and applied.
         """
-        if self._links_changed:
-            self._update_frames()
-        undone, applied, work = self._undo(), 0, 0
-        while len(self._applied) < len(self._order) and (budget is None or work < budget):
-            contribution = self._contributions[self._order[len(self._applied)]]
-            self._apply(contribution)
-            applied += 1
-            work += 1 + len(contribution.xyz)
-        return undone, applied
+        work = _Work(budget)
+        while self.pending and not work.over:
+            if not self.revising:
+                self._admit(work)
+                if self._late:  # the budget is used up
+                    break
+                self._begin(work, keep)
+            if self._prepare(work):
+                self._apply_on(work)
+            if self.revising and self._upwards and len(self.folded.applied) == len(self._order):
+                self.revising = self._upwards = False
+                self._kept = None
+                self.version += 1
+                if work.bounded:
+                    break
+        return work.undone, work.applied
+
+    def drop_records(self) -> None:
+        """Drop the undo records of all but the newest; what comes before them later is folded
+        anew from the first transaction on."""
+        if not self.revising:
+            self.folded.drop_records(self._config.ledger.undo_kept)
+
+    def picture(self, origin: FrameId) -> Picture:
+        """A component as it is folded; in a revision what was to be kept, as it was before it."""
+        if self._kept is not None:
+            return self._kept
+        if self._copying is not None:
+            return self._copying.picture
+        return self.folded.picture(origin)
 
     def placement(self, author: AuthorId, session: int) -> Placement:
         """The component of a SLAM frame and the (7,) pose of the frame in it."""
         frame = FrameId(author, session)
         return self.frames.get(frame) or (frame, np.array(IDENTITY_POSE, np.int32))
 
-    def nodes(self, component: FrameId) -> tuple[NodeColumns, Verdict] | None:
-        """The nodes of a component and what the fleet thinks of them (`advance` first)."""
-        found = self._components.get(component)
-        if found is None or len(found.fold) == 0:
-            return None
-        if found.verdict is None:  # weighed once, however often it is read
-            found.verdict = found.fold.evaluate(found.rays)
-        return found.fold.columns(), found.verdict
-
     def settled(self, author: AuthorId, session: int, points: Int32s, repeats: int) -> Bools:
         """(N,) points (N, 3) mm in an author's SLAM frame of which it has said all that counts."""
         component, pose = self.placement(author, session)
-        found, known = self._components.get(component), self.authors.get(author)
+        found, known = self.folded.components.get(component), self.authors.get(author)
         if found is None or known is None:
             return np.zeros(len(points), np.bool_)
         placed, inside = np.empty_like(points), np.ones(len(points), np.bool_)
         apply_pose(pose, points, placed, inside)
         return found.fold.settled(known.index, placed, repeats) & inside
 
-    def against(self, component: FrameId) -> Int32s:
-        """(N,) what speaks against each node of a component, whether it counts or not."""
-        found = self._components[component]
-        if isinstance(found.fold, DefaultFold):
-            return found.fold.weigh(found.rays).against
-        return found.fold.evaluate(found.rays).misses
-
-    def feature_nodes(self, component: FrameId, author: Author) -> Int32s:
-        """The node of each feature number of an author in a component, -1 where none."""
-        return self._components[component].fold.feature_nodes(author.index)
-
     def digest(self) -> bytes:
         """32 bytes over all components (nodes, their evidence, their states) and the frames."""
         self.advance()
         digest = hashlib.blake2b(digest_size=32, person=b"dagmap map 1")
-        for component in sorted(self._components):
-            found = self.nodes(component)
-            if found is None:
-                continue
-            digest.update(_frame_bytes(component))
-            for column in (*found[0].columns(), *found[1].columns()):
-                little = np.ascontiguousarray(column, column.dtype.newbyteorder("<"))
-                digest.update(b"%s %d;" % (little.dtype.str.encode(), little.size))
-                digest.update(little.data)
+        self.folded.digest_into(digest)
         for frame, (origin, pose) in sorted(self.frames.items()):
-            digest.update(_frame_bytes(frame) + _frame_bytes(origin) + pose.astype("<i4").tobytes())
+            digest.update(frame_bytes(frame) + frame_bytes(origin) + pose.astype("<i4").tobytes())
         return digest.digest()
 
     @property
     def nbytes(self) -> int:
         """Memory held by folds, ray evidence and placed features."""
-        folds = sum(c.fold.nbytes + c.rays.nbytes for c in self._components.values())
-        return folds + sum(c.xyz.nbytes + c.color.nbytes for c in self._contributions.values())
+        return self.folded.nbytes + sum(
+            c.xyz.nbytes + c.color.nbytes for c in self._contributions.values()
+        )
+
+    def _take(self, what: Transaction | _Cut) -> None:
+        """Order a transaction, or do a cut; now, or once the revision under way is over."""
+        if self._upwards or self._late:
+            self._late.append(what)
+        elif isinstance(what, _Cut):
+            self._cut(*what)
+        else:
+            contribution = Contribution(what, self.author(what.author), self._config)
+            self._contributions[what.key] = contribution
+            insort(self._order, what.key)
+            self._restale((what.key,))
+            self._note(contribution)
+            what.drop_columns()
+
+    def _cut(self, id_: AuthorId, sequence: int) -> None:
+        mine = [key for key in self._order if key[1] == id_]
+        gone = {key for key in mine if key[2] >= sequence}
+        if not gone:
+            return
+        self._restale(mine)
+        self._gone += [self._contributions.pop(key) for key in sorted(gone)]
+        self._stale -= gone
+        self._order = [key for key in self._order if key not in gone]
+        self.authors[id_] = Author(id_, self.authors[id_].index)
+        self._links_changed = True
+        for key in mine:
+            if key not in gone:
+                self._contributions[key].author = self.authors[id_]
+                self._note(self._contributions[key])
+
+    def _admit(self, work: _Work) -> None:
+        """What came in the last revision."""
+        late, self._late, done = self._late, [], 0
+        while done < len(late) and not work.over:
+            self._take(late[done])
+            work.left -= TRANSACTION
+            done += 1
+        self._late = late[done:]
+
+    def _begin(self, work: _Work, keep: FrameId | None) -> None:
+        """See whether something is to be undone; keep a picture where that will take long."""
+        changed = self._links_changed
+        if changed:
+            self._update_frames()
+        self.revising = self._undoes or bool(self._gone)
+        if not self.revising:
+            self.version += changed
+        elif keep is not None and self._takes_long(work):
+            self._copying = Copying(self.folded.picture(keep))
+
+    def _takes_long(self, work: _Work) -> bool:
+        """Whether the budget will not suffice to undo and to apply again."""
+        folded = self.folded
+        left, at = work.left - sum(map(folded.walk_units, self._gone)), len(folded.applied)
+        while at > 0 and self._mark is not None and folded.applied[at - 1].key >= self._mark:
+            at = 0 if at == folded.firm else at - 1
+            left -= folded.undo_units(folded.applied[at])
+            if left <= 0:
+                return True
+        for key in self._order[at:]:
+            left -= self._apply_units(self._contributions[key])
+            if left <= 0:
+                return True
+        return False
+
+    def _prepare(self, work: _Work) -> bool:
+        """Copy, undo, take back the rays of what was cut. Whether all of that is done."""
+        if self._upwards:
+            return True
+        if self._copying is not None:
+            work.left -= self._copying.step(int(min(work.left, 1 << 40)))
+            if not self._copying.done:
+                return False
+            self._kept, self._copying = self._copying.finished(), None
+        if self._links_changed:
+            self._update_frames()
+        while self._undoes and not work.over:
+            before = len(self.folded.applied)
+            work.left -= self.folded.undo()
+            work.undone += before - len(self.folded.applied)
+        while self._gone and not self._undoes and not work.over:
+            work.left -= self.folded.walk_units(self._gone[-1])
+            self.folded.walk(self._gone.pop(), -1)
+        if self._undoes or self._gone:
+            return False
+        self._mark = None
+        self._upwards = self.revising
+        return True
+
+    @property
+    def _undoes(self) -> bool:
+        """Whether something is applied that the mark says is not as it should be."""
+        applied, mark = self.folded.applied, self._mark
+        return mark is not None and bool(applied) and applied[-1].key >= mark
+
+    def _apply_on(self, work: _Work) -> None:
+        """Apply what comes next in the order."""
+        first = len(self.folded.applied)
+        for key in self._order[first:]:
+            if work.over:
+                break
+            contribution = self._contributions[key]
+            work.left -= self._apply_units(contribution)
+            work.applied += 1
+            self._apply(contribution)
+        if not self.revising:
+            self.version += len(self.folded.applied) > first
 
     def _restale(self, keys: Iterable[Key]) -> None:
         """These are not placed as they should be: place and apply them (again)."""
@@ -187,6 +298,8 @@ class Consensus:
         for anchor in tx.payload.anchors:
             known = author.anchors.get(anchor.cycle)
             author.anchors[anchor.cycle] = anchor
+            if len(author.sessions) < MAX_SESSIONS:
+                author.sessions.add(anchor.session)
             if known is None or not _same(known, anchor):
                 self._restale(author.seen_in.get(anchor.cycle, ()))
         self._restale(author.retract(tx.payload.retracted))
@@ -209,52 +322,20 @@ class Consensus:
                 if frame is not None and not _alike(before.get(frame), self.frames.get(frame)):
                     self._restale(keys)
 
-    def _undo(self) -> int:
-        """Take back everything from the mark on."""
-        if self._mark is None:
-            return 0
-        undone = 0
-        while self._applied and self._applied[-1] >= self._mark:
-            contribution = self._contributions[self._applied.pop()]
-            for part in reversed(contribution.parts):
-                self._component(part.component).fold.undo(contribution.block(part))
-            undone += 1
-        self._mark = None
-        return undone
-
     def _apply(self, contribution: Contribution) -> None:
+        folded = self.folded
         if contribution.key in self._stale:
-            self._walk(contribution, -1)
+            folded.walk(contribution, -1)
             contribution.place(self.placement, self._config)
-            self._walk(contribution, +1)
+            folded.walk(contribution, +1)
             self._stale.discard(contribution.key)
-        for part in contribution.parts:
-            self._component(part.component).fold.apply(contribution.block(part))
-        self._applied.append(contribution.key)
+        folded.apply(contribution)
 
-    def _walk(self, contribution: Contribution, sign: int) -> None:
-        if self._config.fold.preset == "paper":  # Algorithm 2 knows no rays
-            return
-        for part in contribution.parts:
-            self._component(part.component).rays.walk(
-                contribution.author.index,
-                part.origins,
-                contribution.starts,
-                contribution.xyz,
-                contribution.alive(part),
-                sign,
-            )
-
-    def _component(self, id_: FrameId) -> Component:
-        """A component that is about to change."""
-        found = self._components.get(id_)
-        if found is not None:
-            found.verdict = None
-        if found is None:
-            fold = self._config.fold
-            rays = RayEvidence(fold.cell_mm, fold.max_ray_mm, self._salt)
-            found = self._components[id_] = Component(make_fold(fold, self._salt), rays)
-        return found
+    def _apply_units(self, contribution: Contribution) -> int:
+        units = self.folded.apply_units(contribution)
+        if contribution.key in self._stale:
+            units += self.folded.place_units(contribution)
+        return units
 
 
 def _same(a: Anchor, b: Anchor) -> bool:
@@ -265,7 +346,3 @@ def _alike(a: Placement | None, b: Placement | None) -> bool:
     if a is None or b is None:
         return a is b
     return a[0] == b[0] and np.array_equal(a[1], b[1])
-
-
-def _frame_bytes(frame: FrameId) -> bytes:
-    return frame.author + frame.session.to_bytes(4, "little")

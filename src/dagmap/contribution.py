@@ -41,6 +41,7 @@ class Author:
     bases: list[int] = field(default_factory=list)  # first feature number of each contribution
     keys: list[Key] = field(default_factory=list)  # of the same contributions
     seen_in: dict[int, list[Key]] = field(default_factory=dict)  # contributions by cycle
+    sessions: set[int] = field(default_factory=set)  # of its anchors, the first ones
 
     def retract(self, numbers: Int64s) -> list[Key]:
         """Mark features (ascending numbers) as withdrawn; the contributions that held them."""
@@ -104,6 +105,11 @@ class Contribution:
     @property
     def key(self) -> Key:
         return self.transaction.key
+
+    @property
+    def size(self) -> int:
+        """Observations: features and sightings."""
+        return len(self.xyz) + sum(len(sighting.numbers) for sighting in self.sightings)
 
     @property
     def touched_cycles(self) -> set[int]:

@@ -82,6 +82,9 @@ class DefaultFold:
         matching.revert(self._nodes, self._shift, block.author, _seen(block), base, features, undo)
         self._features.close(block)
 
+    def drop_records(self, keep: int) -> None:
+        self._features.drop(keep)
+
     def feature_nodes(self, author: int) -> Int32s:
         return self._features.of(author)
 

@@ -1,61 +1,141 @@
 """Where every SLAM frame lies in the fleet: the same on every robot, from the links alone.
 
 Per connected component the origin is the frame of the lowest author id (the fleet's own frame has
-author zero); the spanning tree takes the links with the most inliers first, then the lowest ids.
+author zero). The spanning tree takes links by their standing, then those with the most inliers,
+then the lowest ids:
+  1. a robot's word on where its frame lies in the fleet's own;
+  2. an author's links between frames of its own;
+  3. links that both ends have published, alike: neither end can be placed by another's word;
+  4. what only one end says, where that end stands alone: it places itself, and nobody else.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 
 from .kernels.geometry import compose, invert
-from .model import FLEET_FRAME, FrameId, Int32s
+from .model import FLEET_FRAME, QUATERNION_ONE, FrameId, Int32s
 from .payload import Link
 
 IDENTITY_POSE = (1 << 30, 0, 0, 0, 0, 0, 0)
+ALIKE_MM = 300  # two ends' links agree within so much, and
+ALIKE_W = round(QUATERNION_ONE * 0.99966)  # cosine of half the angle: 3 degrees
+Placed = dict[FrameId, tuple[FrameId, Int32s]]
 
 
-def place_frames(links: Iterable[Link]) -> dict[FrameId, tuple[FrameId, Int32s]]:
-    """For every linked frame: (origin of its component, (7,) pose of the frame in the origin)."""
+class Standing(IntEnum):
+    """What a link rests on, the best first."""
+
+    CONFIGURED = 0
+    OWN = 1
+    MUTUAL = 2
+    CLAIMED = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Edge:
+    standing: Standing
+    inliers: int
+    link: Link
+
+    @property
+    def merit(self) -> tuple[int, int, FrameId, FrameId, bytes]:
+        link = self.link
+        return (self.standing, -self.inliers, link.source, link.target, link.pose.tobytes())
+
+
+def place_frames(links: Iterable[Link]) -> Placed:
+    """For every linked frame: (origin of its component, (7,) pose of the frame in the origin).
+
+    Each link is its source's author's; a link of 0 inliers is none.
+    """
     neighbours: dict[FrameId, list[tuple[FrameId, Int32s]]] = {}
-    for link in _spanning_tree(links):
+    for link in _spanning_tree(_edges(links)):
         neighbours.setdefault(link.source, []).append((link.target, link.pose))
         neighbours.setdefault(link.target, []).append((link.source, invert(link.pose)))
-    placed: dict[FrameId, tuple[FrameId, Int32s]] = {}
+    placed: Placed = {}
     for origin in sorted(neighbours):
         if origin not in placed:
             _place_component(origin, neighbours, placed)
     return placed
 
 
-def _spanning_tree(links: Iterable[Link]) -> list[Link]:
+def contradicted(links: Iterable[Link], placed: Placed) -> list[Link]:
+    """Links of both ends' that the frames as placed do not bear out: some chain is wrong."""
+    out = []
+    for edge in _edges(links):
+        link = edge.link
+        ends = placed.get(link.source), placed.get(link.target)
+        if edge.standing != Standing.MUTUAL or ends[0] is None or ends[1] is None:
+            continue
+        if ends[0][0] == ends[1][0]:
+            chain = compose(invert(ends[1][1]), ends[0][1])
+            if not alike(chain, link.pose):
+                out.append(link)
+    return out
+
+
+def alike(one: Int32s, other: Int32s) -> bool:
+    """Whether two poses (7,) are one measurement: within 300 mm and 3 degrees."""
+    turn = compose(invert(one), other)
+    apart = one[4:].astype(np.int64) - other[4:].astype(np.int64)
+    return abs(int(turn[0])) >= ALIKE_W and int((apart * apart).sum()) <= ALIKE_MM * ALIKE_MM
+
+
+def _edges(links: Iterable[Link]) -> list[_Edge]:
+    """Links by what they rest on. Of two ends that agree the lower author's pose counts."""
+    known: dict[tuple[FrameId, FrameId], Link] = {}
+    for link in sorted(links, key=_bytes):
+        if link.inliers and link.source != link.target:
+            known[link.source, link.target] = link
+    out = []
+    for (source, target), link in known.items():
+        back = known.get((target, source))
+        if target == FLEET_FRAME:
+            out.append(_Edge(Standing.CONFIGURED, link.inliers, link))
+        elif source.author == target.author:
+            out.append(_Edge(Standing.OWN, link.inliers, link))
+        elif back is None or not alike(link.pose, invert(back.pose)):
+            out.append(_Edge(Standing.CLAIMED, link.inliers, link))
+        elif source < target:
+            out.append(_Edge(Standing.MUTUAL, min(link.inliers, back.inliers), link))
+    return out
+
+
+def _bytes(link: Link) -> tuple[FrameId, FrameId, int, bytes]:
+    return (link.source, link.target, link.inliers, link.pose.tobytes())
+
+
+def _spanning_tree(edges: list[_Edge]) -> list[Link]:
     """Kruskal over the links, best first."""
     leader: dict[FrameId, FrameId] = {}
+    shared: set[FrameId] = set()  # leaders of components of more than one author
 
     def find(frame: FrameId) -> FrameId:
         while (above := leader.get(frame, frame)) != frame:
             frame = above
         return frame
 
-    def merit(link: Link) -> tuple[bool, int, FrameId, FrameId, bytes]:
-        configured = link.target == FLEET_FRAME  # a robot's word on its own start comes first
-        return (not configured, -link.inliers, link.source, link.target, link.pose.tobytes())
-
     tree = []
-    for link in sorted(links, key=merit):
-        a, b = find(link.source), find(link.target)
-        if a != b:
-            leader[max(a, b)] = min(a, b)
-            tree.append(link)
+    for edge in sorted(edges, key=lambda edge: edge.merit):
+        a, b = find(edge.link.source), find(edge.link.target)
+        if a == b or (edge.standing == Standing.CLAIMED and a in shared):
+            continue
+        if a.author != b.author or a in shared or b in shared:
+            shared.add(min(a, b))
+        leader[max(a, b)] = min(a, b)
+        tree.append(edge.link)
     return tree
 
 
 def _place_component(
     origin: FrameId,
     neighbours: dict[FrameId, list[tuple[FrameId, Int32s]]],
-    placed: dict[FrameId, tuple[FrameId, Int32s]],
+    placed: Placed,
 ) -> None:
     """Walk the tree from its origin. `pose` of an edge (frame, other) carries frame into other."""
     placed[origin] = (origin, np.array(IDENTITY_POSE, np.int32))

@@ -15,13 +15,14 @@ import numpy as np
 
 from .config import Config
 from .graph import AdjacencyDag
-from .kernels.columns import grown
+from .kernels.columns import distinct, grown
 from .model import Bools, Int32s, Int64s, Uint8s
 from .payload import Bundle, Sighting
 
 _PART = 1.0  # s between the parts in which a long cycle goes out
 _WORTH = 64  # features below which a part is not worth its envelope
 _LOOK = 8  # times what may go out that is looked at for news
+ROOM = 50_000  # bytes of records in a transaction at most
 ALL = 1 << 40  # more features than there are
 Known: TypeAlias = Callable[[Int32s], Bools]  # of points (N, 3) mm in the SLAM frame
 
@@ -32,7 +33,7 @@ class Allowance:
 
     features: int = ALL
     per_bundle: int = ALL  # N'_f: what a bundle holds at most
-    room: int = 50_000  # bytes of records in a transaction
+    room: int = ROOM  # bytes of records in a transaction
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,10 +94,9 @@ class Issuance:
         valid = self.graph.validity(nodes) > self._config.graph.v_th
         self._ripen(nodes[valid])
 
-    def unissued_of(self, cycle: int) -> Int64s:
-        """Nodes that a cycle saw first and that are neither issued nor withdrawn, ascending."""
-        nodes = np.flatnonzero(self.cycle[: len(self.graph)] == cycle)
-        return nodes[self._open(nodes)]
+    def unissued(self) -> Int64s:
+        """Nodes that are neither issued nor withdrawn, ascending."""
+        return np.flatnonzero(self.graph.alive() & ~self.graph.issued())
 
     def see_again(self, nodes: Int64s, cycle: int) -> None:
         """Nodes that the SLAM observed once more. Only the latest such cycle is kept a node."""
@@ -173,7 +173,7 @@ class Issuance:
         if len(self._ripe) == 0:
             return self._ripe
         cores = self._ripe[self._open(self._ripe)]
-        cores = np.unique(cores)[::-1]
+        cores = distinct(cores)[::-1]
         if len(cores) > limit:
             cores = self._news_first(cores, limit, known)
         taken, frontier, done, changed = self.graph.take(cores, per_bundle, limit)

@@ -23,6 +23,9 @@ Bools: TypeAlias = npt.NDArray[np.bool_]
 LIMIT_MM = 1 << 29  # coordinates lie within +-LIMIT_MM before and after every pose
 QUATERNION_ONE = 1 << 30
 MAX_CYCLE = (1 << 31) - 1
+MAX_DESCRIBED = 1024  # points of a keyframe: a record of them fits into a transaction
+MAX_KEYFRAMES = 256  # of one author that a robot compares with its own
+DESCRIPTOR = 32  # bytes of a binary descriptor
 MAX_NAME = 64  # bytes of a robot's name
 FLEET_FRAME: FrameId  # defined below
 
@@ -94,6 +97,8 @@ class Cycle:
     moved: (stamps (M,), poses (M, 4, 4)) of earlier cycles that a loop closure has moved, or None.
     removed: ids of points that the SLAM has withdrawn, or None.
     session: another value starts a new SLAM frame and a new space of ids.
+    descriptors: (N, 32) uint8 binary descriptors of the points (ORB), the most telling points
+        first, or None. By them robots that share no frame find each other's.
     """
 
     stamp: float
@@ -104,6 +109,7 @@ class Cycle:
     moved: tuple[npt.ArrayLike, npt.ArrayLike] | None = None
     removed: npt.ArrayLike | None = None
     session: int = 0
+    descriptors: npt.ArrayLike | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,6 +124,7 @@ class QuantisedCycle:
     moved: tuple[tuple[int, Int32s], ...]
     removed: npt.NDArray[np.uint64]
     session: int
+    descriptors: Uint8s | None  # (N, 32)
 
 
 def quantise_cycle(cycle: Cycle) -> QuantisedCycle:
@@ -130,13 +137,16 @@ def quantise_cycle(cycle: Cycle) -> QuantisedCycle:
     if ids is not None and len(ids) != len(points):
         raise CycleError(f"{where}: {len(ids)} ids for {len(points)} points; give one id a point")
     removed = _ids(() if cycle.removed is None else cycle.removed, f"{where}: removed")
-    if len(np.unique(removed)) != len(removed):
+    ordered = np.sort(removed)
+    if (ordered[1:] == ordered[:-1]).any():
         raise CycleError(f"{where}: removed names an id twice; name each withdrawn id once")
     if not _is_session(cycle.session):
         raise CycleError(f"{where}: session {cycle.session!r} is not a number from 0 to 2^32 - 1")
-    colors = None if cycle.colors is None else _colors(cycle.colors, len(points), where)
+    colors = _bytes(cycle.colors, (len(points), 3), f"{where}: colors")
+    described = _bytes(cycle.descriptors, (len(points), DESCRIPTOR), f"{where}: descriptors")
+    moved = _moved(cycle.moved, where)
     return QuantisedCycle(
-        stamp, pose, points, ids, colors, _moved(cycle.moved, where), removed, int(cycle.session)
+        stamp, pose, points, ids, colors, moved, removed, int(cycle.session), described
     )
 
 
@@ -247,13 +257,17 @@ def _array(values: npt.ArrayLike, where: str) -> npt.NDArray[np.generic]:
         raise CycleError(f"{where}: not an array ({error})") from None
 
 
-def _colors(colors: npt.ArrayLike, count: int, where: str) -> Uint8s:
-    array = _array(colors, f"{where}: colors")
-    if array.size == 0 and count == 0:
-        return np.zeros((0, 3), np.uint8)
-    if array.shape != (count, 3) or array.dtype != np.uint8:
+def _bytes(values: npt.ArrayLike | None, shape: tuple[int, int], where: str) -> Uint8s | None:
+    """A column of bytes with one row a point, where there is one."""
+    if values is None:
+        return None
+    array = _array(values, where)
+    if array.size == 0 and shape[0] == 0:
+        return np.zeros(shape, np.uint8)
+    if array.shape != shape or array.dtype != np.uint8:
+        what = where.rpartition(" ")[2]
         raise CycleError(
-            f"{where}: colors are {array.dtype} {array.shape}; ({count}, 3) uint8 is wanted"
+            f"{where}: {what} are {array.dtype} {array.shape}; {shape} uint8 is wanted"
         )
     return array.astype(np.uint8, copy=False)
 

@@ -3,7 +3,7 @@ retractions, and in the end the payloads of its transactions (sections 4.1 and 4
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import TypeAlias
 
@@ -13,9 +13,11 @@ import numpy.typing as npt
 from .backlog import Backlog, Seen
 from .config import Config
 from .graph import AdjacencyDag
-from .issuance import Allowance, Issuance, Known
+from .issuance import ROOM, Allowance, Issuance, Known
 from .kernels.codec import morton_order
+from .kernels.columns import distinct, grown
 from .kernels.geometry import apply_pose
+from .keyframes import Keyframes, fill
 from .model import (
     FLEET_FRAME,
     AuthorId,
@@ -27,12 +29,13 @@ from .model import (
     QuantisedCycle,
     quantise_pose,
 )
-from .payload import Anchor, Link, Payload, Sighting
+from .payload import CERTAIN, Anchor, Link, Payload, Sighting
 from .transaction import Transaction
 
 Settled: TypeAlias = Callable[[Int32s], Bools]  # of points (N, 3) mm in the SLAM frame
-CERTAIN = (1 << 31) - 1  # inliers of a link that was configured, not measured
 _LEFT = -2  # node of an id whose point is left for later; -1: it has none for other reasons
+_REARRANGED = 2048  # nodes that leave the DAG, or come back elsewhere, in one call
+_MOST_MOVED, _MOST_RETRACTED = 1024, 16_384  # that go out in one call
 # Bytes that each costs at most in a transaction
 _FEATURE, _PARENT, _ANCHOR, _NUMBER, _SIGHTING = 22, 6, 48, 6, 16
 NONE = np.zeros(0, np.int64)
@@ -49,9 +52,10 @@ class Observing:
         self._sessions: dict[int, int] = {}  # last stamp of each session
         self._anchors: list[Anchor] = []  # to be published
         self._anchors_since: float | None = None  # `now` at the first of them
-        self._moved = False
+        self._moved: list[Anchor] = []  # to be published anew
         self._retracted: list[Int64s] = []
         self._links: list[Link] = []
+        self._keyframes = Keyframes(config.placing)
         self._introduced = config.closed  # there the certificate names the robot
         self._earlier: list[Issuance] = []  # of former sessions, with features held back
         self.backlog = Backlog(config.overhead.backlog)
@@ -62,6 +66,9 @@ class Observing:
         self.graph = AdjacencyDag(self._config.graph, self._salt)
         self.issuance = Issuance(self._config, self.graph)
         self._nodes: dict[int, int] = {}  # node of each id that the SLAM gave and did not remove
+        self._id_of: npt.NDArray[np.uint64] = np.zeros(0, np.uint64)  # by node, where it has one
+        self._leaving: list[Int64s] = []  # nodes that were removed, still in the DAG
+        self._moving: list[Anchor] = []  # whose unissued nodes are still where they were
         self._cycle_of: dict[int, int] = {}  # cycle number of a stamp
 
     def resume(self, chain: Sequence[Transaction]) -> None:
@@ -88,12 +95,13 @@ class Observing:
             )
         fresh = cycle.session != self.session
         known = {} if fresh else self._nodes
-        for id_ in cycle.removed.tolist():
-            if id_ not in known:
-                raise CycleError(
-                    f"{where}: removed names {id_}, which this session has not seen or has "
-                    "removed before; name ids once, after their point"
-                )
+        ids = cycle.removed.tolist()
+        if not all(map(known.__contains__, ids)):
+            unknown = next(id_ for id_ in ids if id_ not in known)
+            raise CycleError(
+                f"{where}: removed names {unknown}, which this session has not seen or has "
+                "removed before; name ids once, after their point"
+            )
         cycles = {} if fresh else self._cycle_of
         for stamp, _ in cycle.moved:
             if stamp not in cycles:
@@ -112,15 +120,41 @@ class Observing:
         if cycle.session != self.session or not self._sessions:
             self._enter(cycle.session)
         if len(cycle.removed):
-            ids = cycle.removed.tolist()
-            nodes = np.sort(np.array([self._nodes.pop(id_) for id_ in ids], np.int64))
-            nodes = nodes[nodes >= 0]  # others were thrown out of range by a move
+            nodes = np.sort(np.array(list(map(self._nodes.pop, cycle.removed.tolist())), np.int64))
+            self._leaving.append(nodes[nodes >= 0])  # others were thrown out of range by a move
+        moved = [Anchor(self._cycle_of[s], self.session, s, pose) for s, pose in cycle.moved]
+        for anchor in moved:
+            self.backlog.move(anchor.cycle, anchor.pose)
+        self._moved += moved
+        self._moving += moved
+
+    def rearrange(self, limit: int = _REARRANGED) -> None:
+        """Do in the DAG what `withdraw` took, for about so many nodes.
+
+        What is not done in this call stays where it is, which is only a matter of structure: should
+        it go out before, then it is retracted, or its anchor has moved.
+        """
+        while self._leaving and limit > 0:
+            nodes, rest = self._leaving[0][:limit], self._leaving[0][limit:]
+            self._leaving[:1] = [rest] if len(rest) else []
             numbers = self.issuance.number[nodes]
             self._retracted.append(numbers[numbers >= 0])
             self.issuance.revalue(self.graph.withdraw(nodes))
-        names = {node: id_ for id_, node in self._nodes.items() if node >= 0} if cycle.moved else {}
-        for stamp, pose in cycle.moved:
-            self._move(self._cycle_of[stamp], stamp, pose, names)
+            limit -= len(nodes)
+        unissued = self.issuance.unissued() if self._moving and limit > 0 else NONE
+        batch: list[tuple[Int64s, Int32s]] = []
+        done = 0
+        while done < len(self._moving) and limit > 0:
+            anchor = self._moving[done]
+            if any(anchor.cycle == moved.cycle for moved in self._moving[:done]):
+                break  # moved again: the nodes have to be there first
+            done += 1
+            mine = self.issuance.cycle[unissued] == anchor.cycle
+            if mine.any():
+                batch.append((unissued[mine], anchor.pose))
+                limit -= int(mine.sum())
+        del self._moving[:done]
+        self._reinsert(batch)
 
     def insert(
         self, cycle: QuantisedCycle, now: float, settled: Settled, limit: int | None = None
@@ -136,6 +170,7 @@ class Observing:
         self._publish(Anchor(number, cycle.session, cycle.stamp, cycle.pose), now)
         self.issuance.begin(now)
         self.observed += len(cycle.points)
+        self._keyframes.see(number, cycle)
         order = morton_order(cycle.points)
         if cycle.ids is not None:
             order = self._first_seen(cycle.ids, order, number)
@@ -169,6 +204,9 @@ class Observing:
         seen = seen.rows(fresh)
         count = len(seen.points)
         nodes = self.graph.insert(positions[fresh])
+        if seen.ids is not None and len(nodes):
+            self._id_of = grown(self._id_of, int(nodes[-1]) + 1, 0)
+            self._id_of[nodes] = seen.ids
         color = np.zeros((count, 3), np.uint8) if seen.colors is None else seen.colors
         colored = np.full(count, seen.colors is not None, np.bool_)
         cycle = np.full(count, seen.cycle, np.int32)
@@ -180,10 +218,22 @@ class Observing:
         """The node of an id that the SLAM gave; -1 where it is unknown or has left."""
         return max(self._nodes.get(id_, -1), -1)
 
+    def relate(self, links: Iterable[Link], wanted: bool) -> None:
+        """Publish links of the robot's own frames; and its described points, where `wanted`."""
+        self._links.extend(links)
+        self._keyframes.wanted = wanted
+
+    @property
+    def rearranging(self) -> bool:
+        """Whether `rearrange` has something to do."""
+        return bool(self._leaving or self._moving)
+
     @property
     def waiting(self) -> bool:
         """Whether something is to be sent sooner or later."""
-        if self._anchors or self._links or self._retracted or len(self.backlog):
+        if self._anchors or self._moved or self._links or self._retracted or len(self.backlog):
+            return True
+        if self.rearranging or self._keyframes.due:
             return True
         return any(issuance.waiting for issuance in (*self._earlier, self.issuance))
 
@@ -203,30 +253,35 @@ class Observing:
         nodes = NONE if batch is None else batch.nodes
         sightings = [] if batch is None else list(batch.sightings)
         anchors, self._anchors, self._anchors_since = self._anchors, [], None
-        retracted = np.unique(np.concatenate([NONE, *self._retracted]))
+        anchors, self._moved = anchors + self._moved[:_MOST_MOVED], self._moved[_MOST_MOVED:]
+        retracted = distinct(np.concatenate([NONE, *self._retracted]))
+        self._retracted = [retracted[_MOST_RETRACTED:]] if len(retracted) > _MOST_RETRACTED else []
+        retracted = retracted[:_MOST_RETRACTED]
         links, self._links = tuple(self._links), []
-        self._retracted, self._moved = [], False
+        described = self._keyframes.take()
         name = None if self._introduced else self._config.name or None
         self._introduced = True
-        while anchors or links or name or len(retracted) or sightings or len(nodes):
+        while anchors or links or name or len(retracted) or sightings or len(nodes) or described:
             room = max(allowed.room - 64 * len(links), _ANCHOR)
             mine = anchors[: room // _ANCHOR]
             room -= len(mine) * _ANCHOR
             gone = retracted[: room // _NUMBER]
             room -= len(gone) * _NUMBER
             again, sightings, room = _fill(sightings, room)
+            alone = not (mine or again or len(gone) or len(nodes))
+            shown, described, room = fill(described, ROOM if alone else room)
             each = _FEATURE + _PARENT * self._config.graph.n_p
             count = max(room // each, 1)
             count = min(count, self._config.issuance.features_per_transaction)
             bundle = issuance.bundle(nodes[:count], base) if len(nodes[:count]) else None
-            yield Payload(name, tuple(mine), bundle, gone, again, links)
+            yield Payload(name, tuple(mine), bundle, gone, again, links, described=shown)
             base += len(nodes[:count])
             anchors, retracted, nodes = anchors[len(mine) :], retracted[len(gone) :], nodes[count:]
             links, name = (), None
 
     def _due(self, now: float) -> bool:
         """Whether there is something to say beside features. A mere pose can wait a while."""
-        if self._links or self._retracted or self._moved:
+        if self._links or self._retracted or self._moved or self._keyframes.due:
             return True
         since = self._anchors_since
         return since is not None and now - since >= self._config.sync.announce_period
@@ -235,16 +290,18 @@ class Observing:
         """A session begins: the first one at the start pose, a later one unknown or as before."""
         before = FrameId(self._author, self.session)
         if self._sessions:
+            self.rearrange(1 << 40)
             self.catch_up(_nothing, len(self.backlog))
             if self.issuance.waiting:
                 self._earlier.append(self.issuance)
             self._start_frame()
         self.session = session
+        self._keyframes.start()
         if session in self._sessions:
             return
         here = FrameId(self._author, session)
         start = self._config.start_pose
-        if not self._sessions and start is not None:
+        if not self._sessions and start:
             self._links.append(Link(here, FLEET_FRAME, quantise_pose(start), CERTAIN))
         elif self._sessions and self._config.same_origin:
             self._links.append(Link(here, before, quantise_pose(np.eye(4)), CERTAIN))
@@ -271,35 +328,40 @@ class Observing:
             self.issuance.see_again(np.array(again, np.int64), cycle)
         return np.array(new, np.int64)
 
-    def _move(self, cycle: int, stamp: int, pose: Int32s, names: dict[int, int]) -> None:
-        """A loop closure moved a cycle: its anchor is published anew, not its points.
-
-        Those not issued yet leave the DAG and come back where they are now.
-        """
-        self._publish(Anchor(cycle, self.session, stamp, pose))
-        self._moved = True
-        self.backlog.move(cycle, pose)
-        old = self.issuance.unissued_of(cycle)
-        if len(old) == 0:
+    def _reinsert(self, batch: list[tuple[Int64s, Int32s]]) -> None:
+        """Unissued nodes of cycles that a loop closure moved come back where they are now."""
+        if not batch:
             return
-        self.issuance.revalue(self.graph.withdraw(old))
-        positions, inside = _carry(pose, self.issuance.place[old])
-        nodes = self.graph.insert(positions[inside])
-        kept = old[inside]
-        columns = self.issuance
-        columns.add(
-            nodes,
-            columns.cycle[kept],
-            columns.place[kept],
-            columns.color[kept],
-            columns.colored[kept],
-        )
-        for node in old.tolist():
-            if node in names:
-                self._nodes[names[node]] = -1
+        leaving = np.sort(np.concatenate([old for old, _ in batch]))
+        self.issuance.revalue(self.graph.withdraw(leaving))
+        for old, pose in batch:
+            columns = self.issuance
+            positions, inside = _carry(pose, columns.place[old])
+            nodes, kept = self.graph.insert(positions[inside]), old[inside]
+            columns.add(
+                nodes,
+                columns.cycle[kept],
+                columns.place[kept],
+                columns.color[kept],
+                columns.colored[kept],
+            )
+            self._rename(old, kept, nodes)
+
+    def _rename(self, old: Int64s, kept: Int64s, nodes: Int64s) -> None:
+        """The ids of old nodes name new ones; of those that were not kept, none."""
+        names = self._names(old)
+        self._nodes.update(dict.fromkeys(names.values(), -1))
+        self._id_of = grown(self._id_of, len(self.graph), 0)
         for before, after in zip(kept.tolist(), nodes.tolist(), strict=True):
             if before in names:
                 self._nodes[names[before]] = after
+                self._id_of[after] = names[before]
+
+    def _names(self, nodes: Int64s) -> dict[int, int]:
+        """The id that the SLAM gave, of those of these nodes that have one."""
+        ids = self._id_of[nodes[nodes < len(self._id_of)]].tolist()
+        named = zip(nodes.tolist(), ids, strict=False)
+        return {node: id_ for node, id_ in named if self._nodes.get(id_) == node}
 
 
 def _nothing(points: Int32s) -> Bools:

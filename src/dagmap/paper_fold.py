@@ -65,6 +65,9 @@ class PaperFold:
         )
         self._features.close(block)
 
+    def drop_records(self, keep: int) -> None:
+        self._features.drop(keep)
+
     def feature_nodes(self, author: int) -> Int32s:
         return self._features.of(author)
 

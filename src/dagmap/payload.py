@@ -14,8 +14,10 @@ import numpy as np
 from . import wire
 from .kernels.codec import decode_features, encode_features
 from .model import (
+    DESCRIPTOR,
     LIMIT_MM,
     MAX_CYCLE,
+    MAX_DESCRIBED,
     MAX_NAME,
     QUATERNION_ONE,
     AuthorId,
@@ -30,7 +32,9 @@ from .wire import Reader, Refusal
 MAX_FEATURES = 4096  # of one bundle record; bounds the work that foreign bytes can ask for
 MAX_NUMBER = (1 << 40) - 1  # of an author's features
 MAX_SEQUENCE = (1 << 40) - 1  # of an author's transactions
+CERTAIN = (1 << 31) - 1  # inliers of a link that was configured, not measured
 _MAX_LIST = 1 << 16
+_DESCRIBED = np.dtype([("position", "<i4", 3), ("descriptor", "u1", DESCRIPTOR)])
 _NORM_SLACK = 1 << 50  # of a quaternion's squared norm 2^60: a thousandth
 
 
@@ -45,6 +49,7 @@ class Kind(IntEnum):
     LINK = 6
     CERTIFICATE = 7
     REVOCATION = 8
+    DESCRIPTORS = 9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,6 +104,15 @@ class Link:
     inliers: int
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Described:
+    """Points of one cycle by which robots that share no frame find each other's."""
+
+    cycle: int
+    position: Int32s  # (n, 3) mm in the frame of the anchor
+    descriptors: Uint8s  # (n, 32), compared by Hamming distance
+
+
 @dataclass(frozen=True, slots=True)
 class Revocation:
     """The fleet key's word on a robot: its first `count` transactions count, no others."""
@@ -119,6 +133,7 @@ class Payload:
     links: tuple[Link, ...] = ()
     certificate: bytes | None = None  # name, then 64 bytes of signature: see identity.py
     revocations: tuple[Revocation, ...] = ()
+    described: tuple[Described, ...] = ()
 
     @property
     def robot(self) -> str | None:
@@ -149,6 +164,9 @@ def encode_payload(payload: Payload) -> bytes:
     records.extend((Kind.LINK, _encode_link(link)) for link in payload.links)
     for gone in payload.revocations:
         records.append((Kind.REVOCATION, gone.author + wire.number(gone.count)))
+    records.extend(
+        (Kind.DESCRIPTORS, _encode_described(keyframe)) for keyframe in payload.described
+    )
     return b"".join(wire.number(kind) + wire.number(len(body)) + body for kind, body in records)
 
 
@@ -178,6 +196,7 @@ def decode_payload(data: bytes, n_p: int) -> Payload:
         tuple(_decode_link(body) for body in found[Kind.LINK]),
         certificates[0] if certificates else None,
         tuple(_decode_revocation(body) for body in found[Kind.REVOCATION]),
+        tuple(_decode_described(body) for body in found[Kind.DESCRIPTORS]),
     )
 
 
@@ -287,12 +306,12 @@ def _decode_bundle(body: Reader, n_p: int) -> Bundle:
 
 def _encode_ascending(numbers: Int64s) -> bytes:
     steps = np.diff(numbers, prepend=np.int64(-1)) - 1
-    return wire.number(len(numbers)) + b"".join(map(wire.number, steps.tolist()))
+    return wire.number(len(numbers)) + wire.numbers(steps)
 
 
 def _decode_ascending(body: Reader) -> Int64s:
     count = body.number(min(_MAX_LIST, body.left))
-    steps = np.array([body.number(MAX_NUMBER) for _ in range(count)], np.int64)
+    steps = body.numbers(count, MAX_NUMBER)
     numbers = np.cumsum(steps + 1) - 1
     if count and int(numbers[-1]) > MAX_NUMBER:
         raise Refusal(Reason.MALFORMED, "feature number out of range")
@@ -323,3 +342,20 @@ def _decode_link(body: Reader) -> Link:
     link = Link(source, target, _decode_pose(body), body.number((1 << 31) - 1))
     body.end()
     return link
+
+
+def _encode_described(keyframe: Described) -> bytes:
+    rows = np.empty(len(keyframe.position), _DESCRIBED)
+    rows["position"], rows["descriptor"] = keyframe.position, keyframe.descriptors
+    return wire.number(keyframe.cycle) + rows.tobytes()
+
+
+def _decode_described(body: Reader) -> Described:
+    cycle = body.number(MAX_CYCLE)
+    if body.left % _DESCRIBED.itemsize or not 0 < body.left // _DESCRIBED.itemsize <= MAX_DESCRIBED:
+        raise Refusal(Reason.MALFORMED, f"described points of {body.left} bytes")
+    rows = np.frombuffer(body.take(body.left), _DESCRIBED)
+    position = rows["position"].astype(np.int32)
+    if (np.abs(position.astype(np.int64)) > LIMIT_MM).any():
+        raise Refusal(Reason.MALFORMED, "described point out of range")
+    return Described(cycle, position, rows["descriptor"].copy())

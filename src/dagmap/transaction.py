@@ -29,6 +29,7 @@ from .wire import Reader, Refusal
 VERSION = 1
 MAX_SIZE = 56_000  # bytes, so that a message that carries one stays under 60 KB
 MAX_LAMPORT = (1 << 48) - 1
+_END = 4 + 64  # bytes: nonce and signature
 _SIGNED = b"dagmap transaction 1\0"
 _WORKED = b"dagmap work 1\0"
 
@@ -118,6 +119,9 @@ def parse(data: bytes, config: Config) -> Transaction:
     reader = Reader(data)
     public_key = _public_key(reader)
     author = author_of(public_key)
+    # First of all, and without reading on: a flood that has not worked costs two hashes.
+    if not _work_holds(_work_seed(config, data[:-_END]), data[-_END:-64], config):
+        raise Refusal(Reason.PROOF_OF_WORK, fault=author)
     try:
         return _parse(reader, data, public_key, author, config)
     except Refusal as refusal:
@@ -134,6 +138,7 @@ def _public_key(reader: Reader) -> bytes:
 def _parse(
     reader: Reader, data: bytes, public_key: bytes, author: AuthorId, config: Config
 ) -> Transaction:
+    """What follows the public key."""
     sequence = reader.number(MAX_SEQUENCE)
     previous = reader.take(32) if sequence else None
     lamport = reader.number(MAX_LAMPORT)
@@ -144,13 +149,10 @@ def _parse(
     size = reader.number(len(data))
     place = (reader.at, reader.at + size)
     body = reader.take(size)
-    unworked = data[: reader.at]
-    nonce, signature = reader.take(4), reader.take(64)
+    signature = reader.take(_END)[4:]
     reader.end()
     certified = sequence == 0 and config.closed and public_key != config.fleet_public_key
     certificate = first_certificate(body) if certified else None
-    if not _work_holds(_work_seed(config, unworked), nonce, config):
-        raise Refusal(Reason.PROOF_OF_WORK)
     if certificate is not None and not certificate_holds(
         certificate, config.fleet_public_key, config.fleet_id, public_key
     ):

@@ -5,7 +5,11 @@ Whole numbers are LEB128 of at most 63 bits in their shortest form; signed ones 
 
 from __future__ import annotations
 
-from .model import AuthorId, Reason
+import numpy as np
+
+from .model import AuthorId, Int64s, Reason
+
+_LONGEST = 8  # bytes of a number that is read together with others: 56 bits
 
 
 class Refusal(Exception):
@@ -48,6 +52,23 @@ class Reader:
             raise Refusal(Reason.MALFORMED, f"number {value} above {limit}")
         return value
 
+    def numbers(self, count: int, limit: int) -> Int64s:
+        """The next `count` numbers (count,), as `number` reads them."""
+        data = np.frombuffer(self.data[self.at : self.at + _LONGEST * count], np.uint8)
+        ends = np.flatnonzero(data < 0x80)[:count]
+        sizes = np.diff(ends, prepend=-1)
+        short = len(ends) == count > 0 and int(sizes.max()) <= _LONGEST
+        if not short or (data[ends[sizes > 1]] == 0).any():  # to be refused, as a rule
+            return np.array([self.number(limit) for _ in range(count)], np.int64)
+        starts = ends - sizes + 1
+        used = data[: int(ends[-1]) + 1].astype(np.int64)
+        shift = 7 * (np.arange(len(used)) - starts.repeat(sizes))
+        values = np.add.reduceat((used & 0x7F) << shift, starts)
+        if int(values.max()) > limit:
+            raise Refusal(Reason.MALFORMED, f"number {int(values.max())} above {limit}")
+        self.at += len(used)
+        return np.asarray(values, np.int64)
+
     def signed(self) -> int:
         value = self.number()
         return (value >> 1) ^ -(value & 1)
@@ -65,6 +86,17 @@ def number(value: int) -> bytes:
         value >>= 7
     out.append(value)
     return bytes(out)
+
+
+def numbers(values: Int64s) -> bytes:
+    """Many of them, one after the other."""
+    sizes = np.ones(len(values), np.int64)
+    for shift in range(7, 63, 7):
+        sizes += values >> shift > 0
+    starts = np.cumsum(sizes) - sizes
+    place = np.arange(int(sizes.sum())) - starts.repeat(sizes)
+    more = place < sizes.repeat(sizes) - 1
+    return bytes((values.repeat(sizes) >> 7 * place & 0x7F | 0x80 * more).astype(np.uint8))
 
 
 def signed(value: int) -> bytes:

@@ -9,8 +9,8 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from .consensus import Consensus
 from .fold import NodeColumns, Verdict
+from .folded import Picture
 from .model import Bools, Floats, FrameId, Int32s, Int64s, State, TransactionId, Uint8s
 
 D = TypeVar("D", bound=np.generic)
@@ -195,22 +195,23 @@ class _Grid:
         )
 
 
-def build_map(consensus: Consensus, origin: FrameId, cell: float) -> WorldMap:
-    """Freeze one component as the fold stands now (`consensus.advance` first)."""
-    found = consensus.nodes(origin)
-    if found is None:
-        return WorldMap(origin, None, None, (), cell)
+def build_map(picture: Picture, cell: float) -> WorldMap:
+    """Freeze one component of the fold."""
+    component = picture.component
+    found = None if component is None else component.nodes()
+    if component is None or found is None:
+        return WorldMap(picture.origin, None, None, (), cell)
     sources = []
-    nodes_of = {a.id: consensus.feature_nodes(origin, a) for a in consensus.authors.values()}
-    for contribution in consensus.contributions():
+    for contribution in picture.contributions:
         author, tx = contribution.author, contribution.transaction
-        nodes = nodes_of[author.id][contribution.base : contribution.base + len(contribution.xyz)]
+        nodes = component.fold.feature_nodes(author.index)
+        mine = nodes[contribution.base : contribution.base + len(contribution.xyz)]
         anchors = (author.anchors.get(cycle) for cycle in contribution.cycles.tolist())
         stamps = [np.nan if anchor is None else anchor.stamp / 1e6 for anchor in anchors]
         seen = np.repeat(np.array(stamps, np.float64), np.diff(contribution.starts))
         name = author.name or author.id.hex()
-        sources.append(_Source(name, tx.id, nodes.copy(), seen))
-    return WorldMap(origin, *found, tuple(sources), cell)
+        sources.append(_Source(name, tx.id, mine.copy(), seen))
+    return WorldMap(picture.origin, *found, tuple(sources), cell)
 
 
 def _as_keys(seeds: Int32s) -> npt.NDArray[np.void]:

@@ -51,6 +51,12 @@ def replay(
     camera: Annotated[
         Path | None, typer.Option(help="camera.json to use instead of the folder's own.")
     ] = None,
+    unknown_frames: Annotated[
+        bool,
+        typer.Option(
+            "--unknown-frames", help="Every robot starts at its own identity and finds the others."
+        ),
+    ] = False,
     force: Annotated[bool, typer.Option(help="Replace the results in a non-empty --out.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print summary.json, no table.")] = False,
 ) -> None:
@@ -59,7 +65,17 @@ def replay(
 
     raise typer.Exit(
         Replay(
-            recordings, out, config, loss, late or [], seed, max_features, camera, force, json
+            recordings,
+            out,
+            config,
+            loss,
+            late or [],
+            seed,
+            max_features,
+            camera,
+            unknown_frames,
+            force,
+            json,
         ).run()
     )
 
@@ -100,6 +116,34 @@ def status(
     from .status import show_status
 
     raise typer.Exit(show_status(target, json))
+
+
+@app.command()
+def view(
+    folder: Annotated[
+        Path | None, typer.Argument(help="The --out of a replay.", show_default=False)
+    ] = None,
+    live: Annotated[
+        str | None, typer.Option(help="Endpoint of a running fleet, as tcp/192.168.1.7:7447.")
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(help="With --live: TOML file with the fleet's name and parameters."),
+    ] = None,
+    robot: Annotated[
+        str | None, typer.Option(help="Whose ledger of a run is shown; default: the first one's.")
+    ] = None,
+    host: Annotated[
+        str, typer.Option(help="Address to serve at; 0.0.0.0 lets others look on.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port to serve at; 0: any that is free.")] = 8080,
+    points: Annotated[int, typer.Option(help="Points that are drawn at most.")] = 400_000,
+    browser: Annotated[bool, typer.Option(help="Open a browser.")] = True,
+) -> None:
+    """Look at a run or at a running fleet in a browser: the map, the robots, the ledger."""
+    from .view import ViewCommand
+
+    ViewCommand(folder, live, config, robot, host, port, points, browser).run()
 
 
 @app.command()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import signal
 import sys
@@ -59,6 +60,8 @@ class AgentCommand:
         log = Log(sys.stderr, self.level)
         with ExitStack() as stack:
             runtime, transport = self._assemble(settings, log, stack)
+            gc.collect()
+            gc.freeze()  # what is loaded by now stays: to look at it again would cost a pause
             with _signals(runtime, log):
                 runtime.listen(settings.config.network.hear_first)
                 session = next_session(runtime.agent)
@@ -70,6 +73,7 @@ class AgentCommand:
                     player.start()
                     stack.callback(player.stop)
                 runtime.run(player, self.until_agreed)
+            runtime.agent.settle()
             answer = report(runtime, transport)
         log.write("info", "stopped", transactions=len(runtime.agent.ledger))
         sys.stdout.write(json.dumps(answer) + "\n" if self.json else _farewell(answer))

@@ -42,6 +42,7 @@ def warm_graph_and_codec() -> None:
     from ..config import GraphConfig
     from ..graph import AdjacencyDag
     from ..kernels.codec import decode_features, encode_features, morton_order
+    from ..registration import match
 
     places = np.zeros((12, 3), np.int32)
     dag = AdjacencyDag(GraphConfig())
@@ -52,6 +53,7 @@ def warm_graph_and_codec() -> None:
     parents, color = np.full((12, 2), -1, np.int64), np.zeros((12, 3), np.uint8)
     data = encode_features(places, parents, 0, starts, color, one)
     decode_features(data, 12, 2, 0, starts, one)
+    match(np.zeros((2, 32), np.uint8), np.ones((2, 32), np.uint8))
 
 
 def warm_fold() -> None:

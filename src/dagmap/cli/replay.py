@@ -31,6 +31,7 @@ from ..io.figures import (
 )
 from ..io.report import write_report
 from ..io.sources import Source, open_source
+from ..io.status import unplaced
 from ..io.store import Store
 from ..model import Accepted, Cycle, DagmapError, Floats, State
 from ..sim.fleet import Fleet
@@ -62,6 +63,7 @@ class Replay:
     seed: int
     max_features: int
     camera: Path | None
+    unknown_frames: bool
     force: bool
     json: bool
     console: Console = field(default_factory=lambda: Console(stderr=True))
@@ -74,6 +76,8 @@ class Replay:
             raise DagmapError(f"--loss {self.loss}: a share from 0 up to, not including, 1")
         config = Config() if self.config_file is None else load_config(self.config_file)
         config = msgspec.structs.replace(config, fleet_key="")  # keys follow from the names here
+        if self.unknown_frames:
+            config = msgspec.structs.replace(config, start_pose=None)
         sources = self._open_sources()
         prepare_out(self.out, self.force)
         started = time.perf_counter()
@@ -216,6 +220,11 @@ class Replay:
                 row["digest"][:16],
             )
         console.print(table)
+        for row in summary["robots"]:
+            for other in row["unplaced"]:
+                whose = f"{row['name']} does not know where {other['name']} is"
+                console.print(f"{whose}: {other['why']}", soft_wrap=True)
+
         nodes = summary["map"]
         console.print(
             f"map: {nodes['nodes']:,} nodes, {nodes['confirmed']:,} confirmed by several robots, "
@@ -236,6 +245,8 @@ def _row(robot: Robot, digest: bytes) -> dict[str, Any]:
         "transactions": robot.transactions,
         "bytes_sent": robot.bytes_sent,
         "bytes_received": robot.bytes_received,
+        "placed": robot.agent.frame() is not None,
+        "unplaced": unplaced(robot.agent),
     }
 
 

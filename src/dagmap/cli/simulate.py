@@ -124,8 +124,8 @@ def _told(failure: Failure) -> str:
             f"BROKEN with seed {failure.seed}: {failure.detail}",
             f"the shortest timeline found has {failure.timeline} events, the last of them:",
             *(f"  {line}" for line in lines[-12:]),
-            f"to see it all, run this scenario with --seed {failure.seed} --timeline -; to have it "
-            f"checked again, with --seed {failure.seed} --seeds 1",
+            f"to see it all, run this scenario with --seed {failure.seed} --timeline -",
+            f"to have it checked again, with --seed {failure.seed} --seeds 1",
             "",
             failure.scenario.toml().decode(),
         ]

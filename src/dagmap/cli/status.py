@@ -24,7 +24,8 @@ def show_status(target: Path, as_json: bool) -> int:
     console = Console()
     lag, nodes = answer["lag"], answer["map"]
     console.print(f"{answer['name']} ({answer['author']}) in fleet {answer['fleet']}")
-    console.print(f"digest {answer['digest']}", soft_wrap=True)
+    digest = answer["digest"] or "not known yet: the map is being revised, and shown as it was"
+    console.print(f"digest {digest}", soft_wrap=True)
     console.print(
         f"map: {nodes['nodes']:,} nodes, {nodes['confirmed']:,} confirmed, "
         f"{nodes['tentative']:,} tentative, {nodes['rejected']:,} rejected"
@@ -39,6 +40,8 @@ def show_status(target: Path, as_json: bool) -> int:
         if direction in ("sent", "received"):
             total = sum(row["bytes"] for row in kinds.values())
             console.print(f"{direction}: {total / 1000:,.0f} kB")
+    for other in answer["unplaced"]:
+        console.print(f"not placed: {other['name']}, session {other['session']}: {other['why']}")
     console.print(_robots(answer))
     return 0
 

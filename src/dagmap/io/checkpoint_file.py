@@ -29,7 +29,7 @@ class CheckpointFile:
 
     def keep(self, agent: Agent) -> None:
         """Write it anew, where enough has come since the last one."""
-        waited = time.monotonic() - self._written >= _PERIOD
+        waited = time.monotonic() - self._written >= _PERIOD and agent.settled
         if waited and len(agent.ledger) > _GROWTH * self._held:
             self.write(agent)
 

@@ -28,10 +28,9 @@ _COLUMNS = (  # key in summary["robots"], heading
     ("features_observed", "Features observed"),
     ("features_issued", "Features issued"),
     ("transactions", "Transactions"),
-    ("bytes_sent", "Bytes sent"),
-    ("bytes_received", "Bytes received"),
-    ("digest", "Digest"),
 )
+_COUNTED = ("bytes_sent", "bytes_received", "features_issued", "features_observed")
+_HEXADECIMAL = set("0123456789abcdef")
 _STATES = (
     ("confirmed", "Confirmed", "seen by enough robots, more hits than misses"),
     ("tentative", "Tentative", "more hits than misses, too few robots so far"),
@@ -76,11 +75,26 @@ td.text { white-space: normal; }
 figure { margin: 0 0 1.5rem; }
 img { max-width: 100%; height: auto; display: block; }
 figcaption { color: #595959; font-size: .88rem; margin-top: .4rem; max-width: 52rem; }
+td code { overflow-wrap: anywhere; white-space: normal; }
+@media screen and (max-width: 40rem) {
+  body { padding: 1rem .8rem 2rem; }
+  .facts { grid-template-columns: 1fr 1fr; }
+  table, tbody, tr, td { display: block; width: 100%; }
+  tr { padding: .4rem 0; border-bottom: 1px solid #ddd; }
+  tr:first-child { display: none; }
+  td, td.text { display: flex; justify-content: space-between; gap: 1rem; text-align: right;
+    padding: .1rem 0; border: 0; white-space: normal; }
+  td::before { content: attr(data-label); color: #595959; text-align: left; flex: none; }
+  td:first-child { font-weight: 600; }
+}
+@page { margin: 14mm; }
 @media print {
-  body { max-width: none; padding: 0; font-size: 10pt; }
-  figure, table, .facts { break-inside: avoid; }
+  body { max-width: none; padding: 0; font-size: 9.5pt; }
+  figure, tr, .facts, .verdict { break-inside: avoid; }
+  img { max-height: 22cm; }
   h2 { break-after: avoid; }
   th, td { white-space: normal; }
+  .facts div, .verdict { -webkit-print-color-adjust: exact; print-color-adjust: exact; }
 }
 """
 
@@ -109,8 +123,10 @@ def write_report(
             *(_figure(figure) for figure in figures),
             f"<h2>Robots</h2>\n{_robots(summary)}",
             f"<h2>Map</h2>\n{_states(summary.get('map', {}))}",
+            f"<h2>Traffic of the robots</h2>\n{_bytes(summary)}",
+            f"<h2>Agreement</h2>\n{_agreement(summary)}",
             _further(summary),
-            f"<h2>Parameters</h2>\n<pre>{escape(parameters.strip())}</pre>",
+            f"<h2>Parameters</h2>\n{_parameters(summary, parameters)}",
             f"<h2>Versions</h2>\n{_table(('Of', 'Version'), versions.items())}",
             "</body>\n</html>\n",
         ]
@@ -161,12 +177,42 @@ def _figure(path: Path) -> str:
 
 
 def _robots(summary: Mapping[str, Any]) -> str:
+    rows = [[robot.get(key) for key, _ in _COLUMNS] for robot in summary.get("robots", [])]
+    return _table([heading for _, heading in _COLUMNS], rows)
+
+
+def _bytes(summary: Mapping[str, Any]) -> str:
+    """What every robot sent and got, a message to everybody counted once, and their sum."""
+    rows, sums = [], dict.fromkeys(_COUNTED, 0)
+    for robot in summary.get("robots", []):
+        counts = {key: robot.get(key) or 0 for key in _COUNTED}
+        sums = {key: sums[key] + count for key, count in counts.items()}
+        rows.append(_traffic_row(robot.get("name"), counts))
+    headings = ("Robot", "Bytes sent", "Bytes received", "Bytes per feature", "Features sent")
+    return _table(headings, [*rows, _traffic_row("All", sums)])
+
+
+def _traffic_row(name: Any, counts: Mapping[str, int]) -> tuple[Any, ...]:
+    sent, received, issued, observed = (counts[key] for key in _COUNTED)
+    share = f"{100 * issued / observed:.1f} %" if observed else None
+    return name, sent, received, sent / issued if issued else None, share
+
+
+def _agreement(summary: Mapping[str, Any]) -> str:
+    """Whose digest is that of the run."""
     rows = []
     for robot in summary.get("robots", []):
-        row = [robot.get(key) for key, _ in _COLUMNS]
-        row[-1] = str(row[-1] or "")[:16]  # all of it stands above, or in summary.json
-        rows.append(row)
-    return _table([heading for _, heading in _COLUMNS], rows)
+        same = robot.get("digest") == summary.get("digest")
+        rows.append((robot.get("name"), "yes" if same else "NO", str(robot.get("digest") or "")))
+    return _table(("Robot", "The same map", "Digest"), rows)
+
+
+def _parameters(summary: Mapping[str, Any], text: str) -> str:
+    """A row each, where the summary has them; else as the text that was given."""
+    told = summary.get("parameters")
+    if not isinstance(told, Mapping):
+        return f"<pre>{escape(text.strip())}</pre>"
+    return _table(("Parameter", "Value"), _flat("parameters.", told, len("parameters.")))
 
 
 def _states(nodes: Mapping[str, Any]) -> str:
@@ -186,16 +232,18 @@ def _further(summary: Mapping[str, Any]) -> str:
     return f"<h2>Further figures</h2>\n{_table(('What', 'Value'), rows)}" if rows else ""
 
 
-def _flat(prefix: str, entries: Mapping[str, Any]) -> Iterable[tuple[str, Any]]:
+def _flat(prefix: str, entries: Mapping[str, Any], cut: int = 0) -> Iterable[tuple[str, Any]]:
+    """Every value with the names that lead to it, less the first `cut` letters of these."""
     for key, value in entries.items():
         if not prefix and key in _SHOWN:
             continue
+        name = f"{prefix}{key}"
         if isinstance(value, Mapping):
-            yield from _flat(f"{prefix}{key}.", value)
+            yield from _flat(f"{name}.", value, cut)
         elif isinstance(value, (list, tuple)):
-            yield f"{prefix}{key}", ", ".join(map(str, value)) or None
+            yield name[cut:], ", ".join(map(str, value)) or None
         else:
-            yield f"{prefix}{key}", value
+            yield name[cut:], value
 
 
 def _table(headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
@@ -204,7 +252,11 @@ def _table(headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     text = [i == 0 or any(_is_words(row[i]) for row in cells) for i in range(len(headings))]
     head = "".join(_cell("th", name, left) for name, left in zip(headings, text, strict=True))
     body = "\n".join(
-        "<tr>" + "".join(_cell("td", v, left) for v, left in zip(row, text, strict=True)) + "</tr>"
+        "<tr>"
+        + "".join(
+            _cell("td", v, left, label) for v, left, label in zip(row, text, headings, strict=True)
+        )
+        + "</tr>"
         for row in cells
     )
     return f'<div class="wide"><table>\n<tr>{head}</tr>\n{body}\n</table></div>'
@@ -214,9 +266,14 @@ def _is_words(value: Any) -> bool:
     return isinstance(value, str) and any(letter.isalpha() for letter in value)
 
 
-def _cell(tag: str, value: Any, left: bool) -> str:
+def _cell(tag: str, value: Any, left: bool, label: str = "") -> str:
+    """label: the heading, which a narrow screen shows beside the value."""
     style = ' class="text"' if left else ""
-    return f"<{tag}{style}>{escape(value if isinstance(value, str) else _number(value))}</{tag}>"
+    named = f' data-label="{escape(label)}"' if label else ""
+    text = escape(value if isinstance(value, str) else _number(value))
+    if isinstance(value, str) and len(value) == 64 and set(value) <= _HEXADECIMAL:
+        text = f"<code>{text}</code>"
+    return f"<{tag}{style}{named}>{text}</{tag}>"
 
 
 def _number(value: Any) -> str:

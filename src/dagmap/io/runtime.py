@@ -169,7 +169,8 @@ class Runtime:
         if (before := time.monotonic()) >= self._next_tick:
             events += self.agent.tick(self.now, self.inbox.unread)
             after = time.monotonic()
-            self._tick_took, self._next_tick = after - before, after + TICK
+            pause = TICK if self.agent.settled else min(max(_SOON, after - before), TICK)
+            self._tick_took, self._next_tick = after - before, after + pause
         elif any(isinstance(event, Accepted) for event in events):
             soon = max(_SOON, self._tick_took)  # folding takes half of the time at most
             self._next_tick = min(self._next_tick, before + soon)
@@ -212,7 +213,7 @@ class Runtime:
             return
         self._unfolded += [event.id for event in events if isinstance(event, Accepted)]
         sealed = [event.id for event in events if isinstance(event, Issued)]
-        folded = [] if self.agent.consensus.pending else self._unfolded
+        folded = self._unfolded if self.agent.settled else []
         if sealed or folded:
             self._log.write(
                 "debug",

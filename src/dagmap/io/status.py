@@ -26,17 +26,19 @@ _PATH = 100  # bytes that the address of a socket has room for, and some
 def report(runtime: Runtime, transport: Transport) -> dict[str, object]:
     """Everything that `dagmap status` shows. To be called in the agent's thread."""
     agent = runtime.agent
-    pending = agent.consensus.pending
+    pending = not agent.settled
     world = agent.map
     return {
         "name": agent.config.name,
         "author": agent.identity.author.hex(),
         "fleet": agent.config.fleet,
-        "digest": agent.digest().hex(),
+        "digest": agent.digest().hex() if agent.settled else None,  # it may take long to settle
         "uptime_s": round(runtime.now, 3),
         "transactions": len(agent.ledger),
         "cycles": runtime.counts.cycles,
         "map": {"nodes": len(world), **{s.name.lower(): world.count(s) for s in State}},
+        "placed": agent.frame() is not None,
+        "unplaced": unplaced(agent),
         "heads": _heads(agent),
         "peers": _peers(agent, transport, runtime.now),
         "lag": {
@@ -49,6 +51,14 @@ def report(runtime: Runtime, transport: Transport) -> dict[str, object]:
         | {"dropped": {"sent": transport.dropped, "received": runtime.inbox.dropped}},
         "refused": {reason.value: count for reason, count in runtime.counts.refused.items()},
     }
+
+
+def unplaced(agent: Agent) -> list[dict[str, object]]:
+    """SLAM frames of which the robot does not know where they are, and why."""
+    return [
+        {"author": f.author.hex(), "name": _name(agent, f.author), "session": f.session, "why": why}
+        for f, why in sorted(agent.unplaced.items())
+    ]
 
 
 def _heads(agent: Agent) -> dict[str, object]:

@@ -183,7 +183,7 @@ class Fleet:
     def agrees(self, robots: Iterable[Robot] | None = None) -> bool:
         """Whether all ledgers count the same transactions and nothing waits to be sent."""
         agents = [robot.agent for robot in (self.robots.values() if robots is None else robots)]
-        if any(agent.holds_back for agent in agents):
+        if any(agent.holds_back or agent.searching for agent in agents):
             return False
         first = _ends(agents[0]) if agents else {}
         return all(_ends(agent) == first for agent in agents[1:])

@@ -190,7 +190,7 @@ class Invariants:
         world = agent.map
         seen = np.zeros(len(world), np.int64)
         for _, author in sorted(agent.consensus.authors.items()):
-            nodes = agent.consensus.feature_nodes(world.origin, author)
+            nodes = agent.consensus.folded.feature_nodes(world.origin, author.index)
             seen[np.unique(nodes[nodes >= 0])] += 1
         self._require(np.array_equal(world.witnesses, seen), "witnesses are miscounted", f"{world}")
         few = seen < agent.config.fold.witnesses
@@ -206,7 +206,9 @@ class Invariants:
             return
         for other in honest:
             fold = other.agent.consensus
-            nodes = fold.feature_nodes(other.agent.map.origin, fold.author(robot.author))
+            nodes = fold.folded.feature_nodes(
+                other.agent.map.origin, fold.author(robot.author).index
+            )
             numbers = np.array(sorted(robot.withdrawn), np.int64)
             alive = nodes[numbers[numbers < len(nodes)]] >= 0
             self._require(

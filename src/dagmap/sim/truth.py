@@ -78,7 +78,7 @@ def judge_lies(
     good = {other.author for other in honest}
     alone = _honest_fold(robot.agent, good)
     origin, say = robot.agent.map.origin, robot.agent.config.fold.miss_say
-    with_liars, without = robot.agent.consensus.nodes(origin), alone.nodes(origin)
+    with_liars, without = robot.agent.consensus.folded.nodes(origin), alone.folded.nodes(origin)
     if with_liars is None or without is None:
         return Lies(**dict.fromkeys(Lies.__struct_fields__, 0) | {"liars": liars})
     states, before = with_liars[1].states, without[1]
@@ -91,7 +91,7 @@ def judge_lies(
     was, now = (np.concatenate([np.zeros(0, np.int32), *side]) for side in zip(*pairs, strict=True))
     kept = before.states[was] != State.REJECTED
     lost = kept & (states[now] == State.REJECTED)
-    proven = before.hits > alone.against(origin) + liars * say  # whatever misses they add
+    proven = before.hits > alone.folded.against(origin) + liars * say  # whatever misses they add
     proven &= before.states != State.REJECTED  # with no liar, a robot's own record may do that
     survives = np.zeros(len(before.states), np.bool_)
     survives[was[~(states[now] == State.REJECTED)]] = True
@@ -132,7 +132,7 @@ def _seen_by(fold: Consensus, origin: FrameId, good: set[AuthorId], count: int) 
     """Nodes that one of these authors observed."""
     seen = np.zeros(count, np.bool_)
     for author in _authors(fold, good):
-        nodes = fold.feature_nodes(origin, author)
+        nodes = fold.folded.feature_nodes(origin, author.index)
         seen[nodes[nodes >= 0]] = True
     return seen
 
@@ -142,7 +142,7 @@ def _pairs(
 ) -> Iterable[tuple[Int32s, Int32s]]:
     """The node of every honest feature without and with the liars."""
     for author in _authors(fold, good):
-        now = fold.feature_nodes(origin, author)
-        was = alone.feature_nodes(origin, alone.author(author.id))
+        now = fold.folded.feature_nodes(origin, author.index)
+        was = alone.folded.feature_nodes(origin, alone.author(author.id).index)
         both = (was[: len(now)] >= 0) & (now[: len(was)] >= 0)
         yield was[: len(now)][both], now[: len(was)][both]

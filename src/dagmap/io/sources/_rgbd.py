@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from ...model import Floats, RecordingError, Uint8s
+from ...model import DESCRIPTOR, Floats, RecordingError, Uint8s
 from ._source import Options, read_bytes
 
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -68,14 +68,15 @@ class FrontEnd:
         cv2.setRNGSeed(0)
         self._orb = cv2.ORB_create(nfeatures=options.max_features)
 
-    def points(self, color: Path, depth: Path) -> tuple[Floats, Uint8s]:
-        """(N, 3) metres and (N, 3) RGB of at most `max_features` features with a valid depth.
+    def points(self, color: Path, depth: Path) -> tuple[Floats, Uint8s, Uint8s]:
+        """(N, 3) metres, (N, 3) RGB and (N, 32) ORB descriptors of at most `max_features` features
+        with a valid depth, the strongest first.
 
         Depth and colour are those of the pixel that the feature rounds to; a depth of 0 or beyond
         `max_depth` is none. Raises RecordingError that names the picture.
         """
         picture, metres = self._color(color), self._depth(depth)
-        place = self._detect(picture)
+        place, descriptors = self._detect(picture)
         pixel = np.floor(place + 0.5).astype(np.int64)
         pixel = np.clip(pixel, 0, (self._camera.width - 1, self._camera.height - 1))
         z = metres[pixel[:, 1], pixel[:, 0]]
@@ -84,14 +85,19 @@ class FrontEnd:
         place, pixel, z = place[valid], pixel[valid], z[valid]
         x = (place[:, 0] - self._camera.cx) * z / self._camera.fx
         y = (place[:, 1] - self._camera.cy) * z / self._camera.fy
-        return np.stack([x, y, z], axis=1), picture[pixel[:, 1], pixel[:, 0], ::-1].copy()
+        colors = picture[pixel[:, 1], pixel[:, 0], ::-1].copy()
+        return np.stack([x, y, z], axis=1), colors, descriptors[valid]
 
-    def _detect(self, picture: Uint8s) -> Floats:
-        """(N, 2) places of the strongest features, strongest first."""
+    def _detect(self, picture: Uint8s) -> tuple[Floats, Uint8s]:
+        """(N, 2) places and (N, 32) descriptors of the strongest features, strongest first."""
         gray = self._cv2.cvtColor(picture, self._cv2.COLOR_BGR2GRAY)
-        found = [(-k.response, k.pt[1], k.pt[0]) for k in self._orb.detect(gray, None)]
-        found = sorted(found)[: self._options.max_features]  # ORB may give more where they tie
-        return np.array([(x, y) for _, y, x in found], np.float64).reshape(-1, 2)
+        features, described = self._orb.detectAndCompute(gray, None)
+        found = sorted((-k.response, k.pt[1], k.pt[0], i) for i, k in enumerate(features))
+        found = found[: self._options.max_features]  # ORB may give more where they tie
+        rows = [i for *_, i in found]
+        place = np.array([(x, y) for _, y, x, _ in found], np.float64).reshape(-1, 2)
+        none = np.zeros((0, DESCRIPTOR), np.uint8)
+        return place, none if described is None else described[rows]
 
     def _color(self, path: Path) -> Uint8s:
         picture = self._decode(path, self._cv2.IMREAD_COLOR)

@@ -3,8 +3,9 @@
 C cycles, N points, M moved poses; (*) marks what may be left out:
 `stamp (C,)` s; `pose (C, 4, 4)` sensor to the robot's SLAM frame; `points (N, 3)` float32 m in the
 sensor frame; `offsets (C + 1,)` first point of each cycle; `ids (N,)` uint64 *; `colors (N, 3)`
-uint8 *; `removed` ids and `removed_offsets (C + 1,)` *; `moved_stamp (M,)`, `moved_pose (M, 4, 4)`
-and `moved_offsets (C + 1,)` *; `session (C,)` *; `version`, 1 where it is left out.
+uint8 *; `descriptors (N, 32)` uint8 *; `removed` ids and `removed_offsets (C + 1,)` *;
+`moved_stamp (M,)`, `moved_pose (M, 4, 4)` and `moved_offsets (C + 1,)` *; `session (C,)` *;
+`version`, 1 where it is left out.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ...model import Cycle, CycleError, Int64s, RecordingError, quantise_cycle
+from ...model import DESCRIPTOR, Cycle, CycleError, Int64s, RecordingError, quantise_cycle
 from ..export import atomic_write
 from ..npy import BROKEN, read_array, read_header, read_layout, read_members
 from ._source import Options, checked
@@ -36,6 +37,7 @@ _LAYOUT: dict[str, tuple[str, tuple[str | int, ...]]] = {
     "offsets": ("iu", ("C+1",)),
     "ids": ("iu", ("N",)),
     "colors": ("u", ("N", 3)),
+    "descriptors": ("u", ("N", DESCRIPTOR)),
     "removed": ("iu", ("R",)),
     "removed_offsets": ("iu", ("C+1",)),
     "moved_stamp": ("fiu", ("M",)),
@@ -94,6 +96,7 @@ class CycleStream:
             else (arrays["moved_stamp"][moved], arrays["moved_pose"][moved]),
             removed=None if removed.start == removed.stop else arrays["removed"][removed],
             session=int(arrays["session"][i]) if "session" in arrays else 0,
+            descriptors=arrays["descriptors"][points] if "descriptors" in arrays else None,
         )
 
 
@@ -164,7 +167,7 @@ def _check_shape(
     letters = {"f": "float", "i": "int", "u": "uint"}
     wanted = f"({', '.join(map(str, layout))}) {' or '.join(letters[kind] for kind in kinds)}"
     fits = dtype.kind in kinds and len(shape) == len(layout) and all(n >= 0 for n in shape)
-    if name == "colors":
+    if name in ("colors", "descriptors"):
         fits, wanted = fits and dtype == np.uint8, wanted + "8"
     for size, length in zip(layout, shape, strict=False):
         known = sizes["C"] + 1 if size == "C+1" else size
@@ -241,6 +244,8 @@ def save_cycles(path: Path | str, cycles: Iterable[Cycle]) -> None:
     counts = [len(rows) for rows in points]
     arrays |= _optional("ids", np.zeros(0, np.uint64), [c.ids for c in kept], counts)
     arrays |= _optional("colors", np.zeros((0, 3), np.uint8), [c.colors for c in kept], counts)
+    none = np.zeros((0, DESCRIPTOR), np.uint8)
+    arrays |= _optional("descriptors", none, [c.descriptors for c in kept], counts)
     if any(len(rows) for rows in removed):
         arrays |= {"removed": np.concatenate(removed), "removed_offsets": _offsets(removed)}
     if any(len(rows) for rows in moved_stamps):

@@ -76,8 +76,9 @@ class TumFolder:
     def __iter__(self) -> Iterator[Cycle]:
         front = FrontEnd(self._cv2, self._camera, self._options)
         for frame, pose in self._placed:
-            points, colors = front.points(frame.color, frame.depth)
-            yield checked(Cycle(frame.stamp, pose, points, colors=colors), self._path)
+            points, colors, described = front.points(frame.color, frame.depth)
+            cycle = Cycle(frame.stamp, pose, points, colors=colors, descriptors=described)
+            yield checked(cycle, self._path)
 
 
 def _frames(path: Path) -> list[_Frame]:

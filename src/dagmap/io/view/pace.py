@@ -1,0 +1,42 @@
+"""Whether a browser keeps up: told from how often it says where its camera is while that moves.
+
+A browser is taken for one that draws in software until it has shown that it is fast: one that must
+turn too many points at once would not even get round to saying so.
+"""
+
+from __future__ import annotations
+
+SLOW = 0.15  # s between two frames: from here on a movement is jerky
+_FAST = 0.04
+_PAUSE = 5.0  # s: not one movement any more
+_PROOF = 15  # fast frames in a row
+_CHANCES = 2  # times that a browser may prove itself
+
+
+class Pace:
+    """One browser's. `slow`: draw less, and much less while its camera moves."""
+
+    def __init__(self) -> None:
+        self.slow = True
+        self._last: float | None = None
+        self._gap = 0.0  # s between its last two frames
+        self._slow_frames = self._fast_frames = self._proofs = 0
+
+    def moved(self, now: float) -> None:
+        """The camera moved, at `now` seconds on any steady clock."""
+        gap = _PAUSE if self._last is None else now - self._last
+        self._last = now
+        if gap >= _PAUSE:
+            return
+        self._gap = gap
+        self._slow_frames = self._slow_frames + 1 if gap > SLOW else 0
+        self._fast_frames = self._fast_frames + 1 if gap < _FAST else 0
+        if self.slow and self._fast_frames >= _PROOF and self._proofs < _CHANCES:
+            self.slow = False
+            self._proofs += 1
+        elif self._slow_frames >= 2:
+            self.slow = True
+
+    def rests(self, now: float, seconds: float) -> bool:
+        """Whether there was no movement for so long; of a slow browser, for three frames too."""
+        return self._last is None or now - self._last >= max(seconds, 3 * self._gap)

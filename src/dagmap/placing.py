@@ -1,0 +1,383 @@
+"""Robots that share no frame: finds how a foreign SLAM frame lies to one of this robot's own.
+
+Everything is read from the ledger: described points of keyframes, anchors, others' links. What is
+found is published as a link, which the others may confirm or not (`frames`). Floats are allowed
+here, since a link is its author's word; where frames lie follows from the links, in integers.
+
+A proposal comes from one pair of keyframes, or is what the other end has published. It is believed
+when it brings together, over all keyframes that look the same way, described points that look alike
+(`registration.Evidence`): enough of them, from pairs of keyframes that have nothing in common, not
+all in one plane, and so that the clouds fit there and not a little beside it. Two proposals that
+contradict each other and are both believable are an ambiguity: then none is published.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .config import PlacingConfig
+from .consensus import Consensus
+from .ledger import Ledger
+from .model import (
+    MAX_KEYFRAMES,
+    AuthorId,
+    Floats,
+    FrameId,
+    Int32s,
+    Uint8s,
+    pose_matrix,
+    quantise_pose,
+)
+from .payload import CERTAIN, Described, Link
+from .registration import Evidence, Views, judge, match, register, rivals
+
+PAIRED = 6  # described points of two keyframes that agree: enough for a proposal
+GROWTH = 2  # a link is published again once what agrees fixes it so much better
+RIVAL = 0.5  # another placement with such a share of the points makes it ambiguous
+REJUDGED = 1.1  # keyframes must have grown by so much before a proposal is judged again
+CANDIDATES = 8  # proposals of two frames that are kept
+_JUDGING = 12  # units: what judging a proposal costs, beside comparing two keyframes
+
+
+@dataclass(slots=True, eq=False)
+class _Keyframe:
+    """A foreign or own keyframe, carried into its SLAM frame by the newest pose of its anchor."""
+
+    author: AuthorId
+    described: Described
+    pose: Int32s  # (7,) of the anchor
+    place: Floats = field(init=False)  # (4, 4) mm
+    points: Floats = field(init=False)  # (N, 3) mm in the SLAM frame
+    depth: float = field(init=False)  # mm, median distance of a point from the sensor
+
+    def __post_init__(self) -> None:
+        self.depth = float(np.median(np.linalg.norm(self.described.position, axis=1)))
+        self.move(self.pose)
+
+    def move(self, pose: Int32s) -> None:
+        self.pose, self.place = pose, pose_matrix(pose)
+        self.place[:3, 3] *= 1000.0
+        turned = self.described.position @ self.place[:3, :3].T
+        self.points = np.asarray(turned + self.place[:3, 3])
+
+    @property
+    def descriptors(self) -> Uint8s:
+        return self.described.descriptors
+
+
+@dataclass(slots=True, eq=False)
+class _Candidate:
+    """A proposal that was judged."""
+
+    pose: Floats  # (4, 4) mm, source into target
+    evidence: Evidence
+    seen: int  # keyframes of both frames when it was judged
+
+
+class _Relation:
+    """How one own frame lies to one other: what was compared, proposed and published."""
+
+    def __init__(self, config: PlacingConfig, source: FrameId, target: FrameId) -> None:
+        self._config, self.source, self.target = config, source, target
+        self.here: list[_Keyframe] = []
+        self.there: list[_Keyframe] = []
+        self.candidates: list[_Candidate] = []
+        self.published: Link | None = None  # by this robot
+        self._weight = 0.0  # of the evidence for it
+        self.answer: Link | None = None  # by the other end
+        self._answered: Link | None = None  # judged already
+        self.reason = "nothing in common was seen yet"
+        self.work = self._work()
+
+    def _work(self) -> Iterator[tuple[int, Link | None]]:
+        """Endless: (what it cost in units, 0 when there is nothing to do; a link to publish)."""
+        pairs = self._pairs()
+        while True:
+            if self.answer is not None and self.answer is not self._answered:
+                self._answered = self.answer
+                yield from self._propose(_inverse(_matrix(self.answer.pose)))
+            pair = next(pairs)
+            if pair is None:
+                yield from self._improve()
+                continue
+            proposal = self._compare(*pair)
+            yield 1, None
+            if proposal is not None and not self._known(proposal):
+                yield from self._propose(proposal)
+
+    def _pairs(self) -> Iterator[tuple[_Keyframe, _Keyframe] | None]:
+        """Every pair of keyframes once, also of those that come later; None while there is none."""
+        a = b = 0
+        while True:
+            if a < len(self.here) and (a <= b or b == len(self.there)):
+                one, a = self.here[a], a + 1
+                for other in self.there[:b]:
+                    yield one, other
+            elif b < len(self.there):
+                other, b = self.there[b], b + 1
+                for one in self.here[:a]:
+                    yield one, other
+            else:
+                yield None
+
+    def _compare(self, one: _Keyframe, other: _Keyframe) -> Floats | None:
+        rows = match(one.descriptors, other.descriptors)
+        if len(rows) < PAIRED:
+            return None
+        found = register(
+            one.points[rows[:, 0]], other.points[rows[:, 1]], self._config.tolerance_mm
+        )
+        return None if found is None or found[1].sum() < PAIRED else found[0]
+
+    def _known(self, pose: Floats) -> bool:
+        """Whether a proposal is one of those judged already."""
+        return any(self._same(pose, known) for known in self.candidates)
+
+    def _same(self, pose: Floats, known: _Candidate) -> bool:
+        return known.evidence.apart(pose, known.pose) <= 4 * self._config.tolerance_mm
+
+    def _improve(self) -> Iterator[tuple[int, Link | None]]:
+        """Judge again what was proposed, once there is much more to judge it by."""
+        for known in self.candidates[:]:
+            grown = len(self.here) + len(self.there) >= REJUDGED * known.seen
+            if grown and known in self.candidates:
+                self.candidates.remove(known)
+                yield from self._propose(known.pose)
+        yield 0, None
+
+    def _propose(self, pose: Floats) -> Iterator[tuple[int, Link | None]]:
+        """Judge a proposal and its rivals; at last the link to publish, if there is news."""
+        here, there = _views(self.here), _views(self.there)
+        candidate = self._judge(here, there, pose)
+        if self._holds(candidate):
+            for rival in rivals(here, there, candidate.evidence, self._config.tolerance_mm):
+                yield _JUDGING, None
+                if not self._known(rival):
+                    self._judge(here, there, rival)
+        yield _JUDGING, self._conclude()
+
+    def _judge(self, here: Views, there: Views, pose: Floats) -> _Candidate:
+        """Judge a proposal and keep it; of those that are the same the best one stays."""
+        evidence = judge(here, there, pose, self._config.tolerance_mm)
+        alike = [c for c in self.candidates if self._same(evidence.pose, c)]
+        self.candidates = [c for c in self.candidates if c not in alike]
+        alike.append(_Candidate(evidence.pose, evidence, len(here.points) + len(there.points)))
+        best = max(alike, key=lambda c: c.evidence.inliers)  # a bad start may end up beside it
+        self.candidates.append(best)
+        self.candidates.sort(key=lambda c: (not self._holds(c), -c.evidence.inliers))
+        del self.candidates[CANDIDATES:]
+        return best
+
+    def _holds(self, candidate: _Candidate) -> bool:
+        return self._lacks(candidate.evidence) is None
+
+    def _lacks(self, evidence: Evidence) -> str | None:
+        """Why a proposal is not believed."""
+        tolerance = self._config.tolerance_mm
+        if evidence.inliers < self._config.inliers:
+            return "too few points agree"
+        if evidence.independent < 2:
+            return "only one keyframe of a robot agrees"
+        if evidence.spread[1] < 2 * tolerance or evidence.spread[2] < tolerance:
+            return "the points that agree lie in one plane or line"
+        if not evidence.sharp:
+            return "the maps fit as well a little beside it"
+        return None
+
+    def _conclude(self) -> Link | None:
+        best, *others = self.candidates
+        self.reason = self._lacks(best.evidence) or ""
+        if self.reason:
+            return self._withdraw()
+        rival = RIVAL * best.evidence.inliers
+        if any(self._holds(c) and c.evidence.inliers >= rival for c in others):
+            self.reason = "the maps fit in more than one way"
+            return self._withdraw()
+        pose = best.pose
+        if self.answer is not None and self.target < self.source:  # the lower one's pose counts
+            said = _inverse(_matrix(self.answer.pose))
+            if best.evidence.apart(said, pose) <= self._config.tolerance_mm / 2:
+                pose = said
+        return self._publish(pose, best.evidence)
+
+    def _publish(self, pose: Floats, evidence: Evidence) -> Link | None:
+        before = self.published
+        if before is not None:
+            moved = evidence.apart(_matrix(before.pose), pose) > self._config.tolerance_mm / 2
+            if not moved and evidence.weight < GROWTH * self._weight:
+                return None
+        self._weight = evidence.weight
+        metres = pose.copy()
+        metres[:3, 3] /= 1000.0
+        self.published = Link(self.source, self.target, quantise_pose(metres), evidence.inliers)
+        return self.published
+
+    def _withdraw(self) -> Link | None:
+        """What was published and does not hold any more is taken back: a link of 0 inliers."""
+        if self.published is None:
+            return None
+        gone = Link(self.source, self.target, self.published.pose, 0)
+        self.published = None
+        return gone
+
+
+class Placing:
+    """One robot's search for the frames of others. `step` a little in every tick."""
+
+    def __init__(self, config: PlacingConfig, me: AuthorId) -> None:
+        self._config, self._me = config, me
+        self._read: dict[AuthorId, int] = {}  # transactions of each chain that were looked at
+        self._waiting: list[tuple[AuthorId, Described]] = []  # their anchors are not known yet
+        self._keyframes: dict[FrameId, list[_Keyframe]] = {}
+        self._relations: dict[tuple[FrameId, FrameId], _Relation] = {}
+        self._turn = 0
+        self.busy = False  # whether the last step found something to compare
+
+    def step(self, ledger: Ledger, consensus: Consensus) -> tuple[list[Link], bool]:
+        """Links to publish, and whether this robot's described points are wanted."""
+        strange = self._strange(consensus)
+        self.busy = False
+        if not strange and not self._keyframes:
+            return [], False  # everybody shares one frame
+        self._take_in(ledger, consensus)
+        links = self._search(consensus)
+        measured = any(r.published or r.answer for r in self._relations.values())
+        return links, bool(strange) or measured
+
+    def why(self, consensus: Consensus) -> dict[FrameId, str]:
+        """Of each frame outside of this robot's components: why it is not placed there."""
+        reasons = dict.fromkeys(sorted(self._strange(consensus)), "no described points came yet")
+        for (_, target), relation in sorted(self._relations.items()):
+            if target in reasons and relation.there and relation.reason:
+                reasons[target] = relation.reason
+        return reasons
+
+    def _strange(self, consensus: Consensus) -> set[FrameId]:
+        """Frames of others, in which something was seen, that no chain of links leads to."""
+        frames = {
+            author.id: {FrameId(author.id, session) for session in author.sessions}
+            for author in consensus.authors.values()
+        }
+        mine = frames.pop(self._me, set())
+        here = {consensus.placement(*frame)[0] for frame in mine}
+        if len(here) > 1:  # a session of its own that is not placed is strange too
+            return set().union(*frames.values(), mine)
+        return {
+            frame
+            for theirs in frames.values()
+            for frame in theirs
+            if mine and consensus.placement(*frame)[0] not in here
+        }
+
+    def _take_in(self, ledger: Ledger, consensus: Consensus) -> None:
+        """Read on in every chain, and carry along what a loop closure has moved."""
+        for author, chain in sorted(ledger.chains.items()):
+            read = self._read.get(author, 0)
+            if chain.end < read:
+                self._forget(author)
+                read = 0
+            for tx in chain.main[read : chain.end]:
+                self._waiting += [(author, keyframe) for keyframe in tx.payload.described]
+            self._read[author] = chain.end
+        waiting, self._waiting = self._waiting, []
+        for author, keyframe in waiting:
+            self._enter(author, keyframe, consensus)
+        self._follow(consensus)
+
+    def _forget(self, author: AuthorId) -> None:
+        """A fork or a revocation has cut a chain: begin anew with its author."""
+        self._waiting = [(id_, k) for id_, k in self._waiting if id_ != author]
+        for frame in [frame for frame in self._keyframes if frame.author == author]:
+            del self._keyframes[frame]
+        for ends in [
+            ends for ends in self._relations if author in (ends[0].author, ends[1].author)
+        ]:
+            del self._relations[ends]
+
+    def _enter(self, author: AuthorId, keyframe: Described, consensus: Consensus) -> None:
+        known = consensus.authors.get(author)
+        anchor = None if known is None else known.anchors.get(keyframe.cycle)
+        if anchor is None:
+            if len(self._waiting) < MAX_KEYFRAMES:
+                self._waiting.append((author, keyframe))
+            return
+        frame = FrameId(author, anchor.session)
+        count = sum(len(k) for f, k in self._keyframes.items() if f.author == author)
+        if count >= MAX_KEYFRAMES:
+            return
+        self._keyframes.setdefault(frame, []).append(_Keyframe(author, keyframe, anchor.pose))
+        self._relate(frame)
+
+    def _relate(self, frame: FrameId) -> None:
+        """Every own frame against every other one; of two own ones the later one is the source."""
+        for other in sorted(self._keyframes):
+            mine = [f for f in (frame, other) if f.author == self._me]
+            if other != frame and mine:
+                source = max(mine)
+                target = other if source == frame else frame
+                if (source, target) not in self._relations:
+                    relation = _Relation(self._config, source, target)
+                    relation.here = self._keyframes[source]
+                    relation.there = self._keyframes[target]
+                    self._relations[source, target] = relation
+
+    def _follow(self, consensus: Consensus) -> None:
+        for keyframes in self._keyframes.values():
+            for keyframe in keyframes:
+                anchors = consensus.authors[keyframe.author].anchors
+                anchor = anchors.get(keyframe.described.cycle)
+                if anchor is not None and anchor.pose is not keyframe.pose:
+                    keyframe.move(anchor.pose)
+
+    def _search(self, consensus: Consensus) -> list[Link]:
+        """Spend this tick's units on the relations in turn."""
+        links: list[Link] = []
+        left, idle = self._config.units_per_tick, 0
+        turns = sorted(self._relations)
+        while left > 0 and idle < len(turns):
+            relation = self._relations[turns[self._turn % len(turns)]]
+            self._turn += 1
+            self._hear(relation, consensus)
+            cost, link = next(relation.work)
+            idle = idle + 1 if cost == 0 else 0
+            self.busy |= cost > 0
+            left -= cost
+            if link is not None:
+                links.append(link)
+        return links
+
+    def _hear(self, relation: _Relation, consensus: Consensus) -> None:
+        """What both ends have published so far."""
+        ends = relation.source, relation.target
+        mine = consensus.author(self._me).links.get(ends)
+        if relation.published is None and mine is not None and 0 < mine.inliers < CERTAIN:
+            relation.published = mine  # by an earlier run of this robot
+        theirs = consensus.authors.get(relation.target.author)
+        answer = None if theirs is None else theirs.links.get((relation.target, relation.source))
+        relation.answer = answer if answer is not None and answer.inliers else None
+
+
+def _views(keyframes: list[_Keyframe]) -> Views:
+    return Views(
+        np.array([keyframe.place for keyframe in keyframes]),
+        [keyframe.points for keyframe in keyframes],
+        [keyframe.descriptors for keyframe in keyframes],
+        float(np.median([keyframe.depth for keyframe in keyframes])) if keyframes else 0.0,
+    )
+
+
+def _matrix(pose: Int32s) -> Floats:
+    """(4, 4) mm of a (7,) pose."""
+    out = pose_matrix(pose)
+    out[:3, 3] *= 1000.0
+    return out
+
+
+def _inverse(pose: Floats) -> Floats:
+    out = np.eye(4)
+    out[:3, :3] = pose[:3, :3].T
+    out[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return out

@@ -1,0 +1,397 @@
+"""Robots that share no frame find each other's from what they saw, or say that they do not."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from dagmap import Agent, Config, Cycle
+from dagmap.config import PlacingConfig, load_config
+from dagmap.frames import contradicted, place_frames
+from dagmap.messages import Transactions, encode
+from dagmap.model import FrameId, pose_matrix, quantise_pose
+from dagmap.payload import Described, Link
+from dagmap.sim.fleet import Fleet
+from dagmap.sim.robot import Robot
+from scene import QUICK, agent, pose
+
+UNKNOWN = msgspec.structs.replace(
+    QUICK, start_pose=None, placing=PlacingConfig(units_per_tick=200, keyframe_distance=0.2)
+)
+Points = np.ndarray
+Corner = tuple[float, float, float]
+
+
+def room(
+    seed: int, low: tuple[float, ...] = (0, 0, 0), high: tuple[float, ...] = (6, 5, 3)
+) -> Points:
+    """(400, 3) places in a box, and nothing else about it."""
+    return np.random.default_rng(seed).uniform(low, high, (400, 3))
+
+
+def names(seed: int, count: int = 400) -> Points:
+    """(N, 32) a descriptor of each place."""
+    return np.random.default_rng(1000 + seed).integers(0, 256, (count, 32)).astype(np.uint8)
+
+
+def walk(
+    places: Points,
+    descriptors: Points,
+    start: Points | None = None,
+    seed: int = 0,
+    count: int = 6,
+    mirror: bool = False,
+    session: int = 0,
+    begin: float = 0.0,
+) -> list[Cycle]:
+    """A robot goes along x through the places and sees 150 of them in each cycle, to 5 mm."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for i in range(count):
+        sensor = pose(0.5 * i, 0.1 * i, 1.0, 0.1 * i)
+        rows = rng.choice(len(places), min(150, len(places)), replace=False)
+        world = places[rows] + rng.normal(0, 0.005, (len(rows), 3))
+        local = (world - sensor[:3, 3]) @ sensor[:3, :3]
+        if mirror:
+            flip = np.diag([-1.0, 1.0, 1.0, 1.0])
+            local, sensor = local @ flip[:3, :3], flip @ sensor @ flip
+        noisy = descriptors[rows].copy()
+        noisy[:, 0] ^= rng.integers(0, 256, len(rows)).astype(np.uint8)  # up to 8 of 256 bits
+        at = sensor if start is None else start @ sensor
+        stamp = begin + float(i)
+        out.append(Cycle(stamp, at, local, session=session, descriptors=noisy))
+    return out
+
+
+STARTS = {"ann": np.eye(4), "bob": pose(3, -2, 1, 2.0), "cid": pose(-7, 4, 0.5, -1.0)}
+
+
+def meet(config: Config = UNKNOWN, **cycles: list[Cycle]) -> dict[str, Agent]:
+    fleet = Fleet(config)
+    for _ in fleet.run(cycles):
+        pass
+    agents = {name: robot.agent for name, robot in fleet.robots.items()}
+    assert len({agent.digest() for agent in agents.values()}) == 1
+    return agents
+
+
+def relative(agents: dict[str, Agent], one: str, other: str, session: int = 0) -> Points | None:
+    """(4, 4) the first one's frame in the other's, as the first one has it."""
+    frames = agents[one].consensus.frames
+    a = frames.get(FrameId(agents[one].identity.author, session))
+    b = frames.get(FrameId(agents[other].identity.author))
+    if a is None or b is None or a[0] != b[0]:
+        return None
+    return np.linalg.inv(pose_matrix(b[1])) @ pose_matrix(a[1])
+
+
+def off(found: Points | None, one: Points, other: Points) -> tuple[float, float]:
+    """Metres and degrees between a placement and the truth."""
+    assert found is not None
+    error = np.linalg.inv(other @ np.linalg.inv(one)) @ found
+    cosine = np.clip((np.trace(error[:3, :3]) - 1) / 2, -1, 1)
+    return float(np.linalg.norm(error[:3, 3])), float(np.degrees(np.arccos(cosine)))
+
+
+@pytest.fixture(scope="module")
+def three() -> dict[str, Agent]:
+    places, described = room(1), names(1)
+    return meet(
+        **{
+            name: walk(places, described, start, seed)
+            for seed, (name, start) in enumerate(STARTS.items())
+        }
+    )
+
+
+def test_robots_find_each_others_frames(three: dict[str, Agent]) -> None:
+    for one, other in (("ann", "bob"), ("bob", "cid"), ("cid", "ann")):
+        metres, degrees = off(relative(three, one, other), STARTS[one], STARTS[other])
+        assert metres < 0.03 and degrees < 0.3
+    assert all(robot.unplaced == {} and len(robot.robots) == 3 for robot in three.values())
+    assert len({robot.map.origin for robot in three.values()}) == 1
+
+
+def test_both_ends_have_said_so(three: dict[str, Agent]) -> None:
+    authors = three["ann"].consensus.authors.values()
+    links = [link for author in authors for link in author.links.values()]
+    ends = {(link.source.author, link.target.author) for link in links if link.inliers}
+    assert all((b, a) in ends for a, b in ends)
+    assert contradicted(links, three["ann"].consensus.frames) == []
+
+
+def test_frames_are_a_function_of_the_transactions(three: dict[str, Agent]) -> None:
+    data = [tx.data for tx in three["ann"].ledger]
+    for seed in range(3):
+        order = data + data[::5]
+        random.Random(seed).shuffle(order)
+        listener = agent(f"listener{seed}", UNKNOWN)
+        for at, item in enumerate(order):
+            listener.receive(encode(Transactions((item,)), UNKNOWN, bytes(8)), float(at))
+            if at % 4 == 0:
+                listener.tick(float(at))
+        assert listener.digest() == three["ann"].digest()
+
+
+def test_a_file_can_say_that_the_start_is_unknown(tmp_path: Path) -> None:
+    (tmp_path / "fleet.toml").write_text("start_pose = []\n")
+    config = load_config(tmp_path / "fleet.toml")
+    robot = agent("ann", config)
+    robot.observe(walk(room(1), names(1))[0], 0.0)
+    assert robot.frame() is None and robot.consensus.frames == {}
+
+
+def test_who_shares_a_frame_pays_nothing() -> None:
+    places, described = room(1), names(1)
+    known = msgspec.structs.replace(UNKNOWN, start_pose=QUICK.start_pose)
+    agents = meet(known, ann=walk(places, described), bob=walk(places, described, seed=1))
+    payloads = [tx.payload for tx in agents["ann"].ledger]
+    assert payloads and not any(payload.described for payload in payloads)
+    assert len(agents["ann"].map) and agents["ann"].unplaced == {}
+
+
+Scene = Callable[[], tuple[list[Cycle], list[Cycle]]]
+
+
+def _elsewhere() -> tuple[list[Cycle], list[Cycle]]:
+    return walk(room(1), names(1)), walk(room(2), names(2), STARTS["bob"])
+
+
+def _noise() -> tuple[list[Cycle], list[Cycle]]:
+    rng = np.random.default_rng(5)
+    cycles = [
+        replace(c, points=rng.uniform(-4, 4, np.shape(c.points)))
+        for c in walk(room(1), names(1), STARTS["bob"], 1)
+    ]
+    return walk(room(1), names(1)), cycles
+
+
+def _mirrored() -> tuple[list[Cycle], list[Cycle]]:
+    return walk(room(1), names(1)), walk(room(1), names(1), STARTS["bob"], 1, mirror=True)
+
+
+def _wall() -> tuple[list[Cycle], list[Cycle]]:
+    wall = room(1, (0, 4, 0), (6, 4, 3))
+    return walk(wall, names(1)), walk(wall, names(1), STARTS["bob"], 1)
+
+
+def _mirrored_wall() -> tuple[list[Cycle], list[Cycle]]:
+    wall = room(1, (0, 4, 0), (6, 4, 3))
+    return walk(wall, names(1)), walk(wall, names(1), STARTS["bob"], 1, mirror=True)
+
+
+def _corridor() -> tuple[list[Cycle], list[Cycle]]:
+    """Ten bays, each like the other."""
+    bay = np.random.default_rng(1).uniform([0, 0, 0], [2, 2, 2.5], (40, 3))
+    places = np.concatenate([bay + np.array([2.0 * i, 0, 0]) for i in range(10)])
+    described = np.concatenate([names(1, 40)] * 10)
+    return walk(places, described), walk(places, described, STARTS["bob"], 1)
+
+
+def _two_rooms() -> tuple[list[Cycle], list[Cycle]]:
+    """The one has seen two rooms that are alike, the other one of them."""
+    first = walk(room(1), names(1))
+    second = walk(room(1), names(1), pose(20), 3, begin=10.0)
+    return first + second, walk(room(1), names(1), STARTS["bob"], 1)
+
+
+NOT_PLACED: dict[str, Scene] = {
+    "no overlap": _elsewhere,
+    "only noise": _noise,
+    "mirrored": _mirrored,
+    "a single wall": _wall,
+    "a single wall, mirrored": _mirrored_wall,
+    "a corridor of equal bays": _corridor,
+    "two equal rooms": _two_rooms,
+}
+
+
+@pytest.mark.parametrize("name", NOT_PLACED)
+def test_what_cannot_be_told_is_not_placed(name: str) -> None:
+    ann, bob = NOT_PLACED[name]()
+    agents = meet(ann=ann, bob=bob)
+    assert relative(agents, "ann", "bob") is None
+    for one, other in (("ann", "bob"), ("bob", "ann")):
+        (reason,) = agents[one].unplaced.values()
+        assert reason
+        assert list(agents[one].unplaced) == [FrameId(agents[other].identity.author)]
+        assert len(agents[one].robots) == 1  # nothing is merged
+
+
+def test_it_is_told_why() -> None:
+    told = {}
+    for name in ("no overlap", "a single wall", "two equal rooms"):
+        ann, bob = NOT_PLACED[name]()
+        told[name] = set(meet(ann=ann, bob=bob)["bob"].unplaced.values())
+    assert told == {
+        "no overlap": {"nothing in common was seen yet"},
+        "a single wall": {"the points that agree lie in one plane or line"},
+        "two equal rooms": {"the maps fit in more than one way"},
+    }
+
+
+def test_a_new_session_is_placed_like_a_new_robot() -> None:
+    places, described = room(1), names(1)
+    again = walk(places, described, STARTS["cid"], 2, session=1, begin=10.0)
+    agents = meet(
+        ann=walk(places, described), bob=walk(places, described, STARTS["bob"], 1) + again
+    )
+    metres, degrees = off(relative(agents, "bob", "ann", 1), STARTS["cid"], np.eye(4))
+    assert metres < 0.03 and degrees < 0.3
+
+
+def test_groups_that_meet_become_one() -> None:
+    """Two pairs in rooms of their own; then one of a pair goes over to the other's room."""
+    here, there = (room(1), names(1)), (room(2), names(2))
+    moved = [
+        replace(c, pose=STARTS["bob"] @ pose(30, 0, 0, 0.5) @ np.asarray(c.pose))
+        for c in walk(*there, seed=4, begin=20.0)
+    ]
+    apart = {
+        "ann": walk(*here),
+        "bob": walk(*here, STARTS["bob"], 1),
+        "cid": walk(*there, STARTS["cid"], 2),
+        "dan": walk(*there, None, 3),
+    }
+    before = meet(**apart)
+    assert relative(before, "ann", "bob") is not None and relative(before, "cid", "dan") is not None
+    assert relative(before, "ann", "cid") is None
+    after = meet(**{**apart, "bob": apart["bob"] + moved})
+    truth = STARTS["cid"] @ np.linalg.inv(pose(30, 0, 0, 0.5))
+    metres, degrees = off(relative(after, "ann", "cid"), np.eye(4), truth)
+    assert metres < 0.1 and degrees < 0.5
+
+
+def test_described_points_spread_like_all_else_and_stay_bounded() -> None:
+    config = msgspec.structs.replace(UNKNOWN, placing=PlacingConfig(points=50, keyframes=3))
+    places, described = room(1), names(1)
+    agents = meet(config, ann=walk(places, described), bob=walk(room(2), names(2), seed=1))
+    for robot in agents.values():
+        shown = [d for tx in robot.ledger for d in tx.payload.described]
+        assert len(shown) == 6 and {len(d.position) for d in shown} == {50}
+
+
+def test_an_agent_that_starts_again_goes_on(three: dict[str, Agent]) -> None:
+    ann = three["ann"]
+    again = Agent.restore(ann.identity, ann.config, [tx.data for tx in ann.ledger])
+    for at in range(5):
+        assert not [e for e in again.tick(float(at)) if type(e).__name__ == "Issued"]
+    assert again.digest() == ann.digest() and again.unplaced == {}
+
+
+A, B, C, LIAR = (FrameId(bytes([n]) * 8) for n in (1, 2, 3, 9))
+
+
+def link(source: FrameId, target: FrameId, inliers: int, x: float = 0.0) -> Link:
+    return Link(source, target, quantise_pose(pose(x)), inliers)
+
+
+def test_a_liar_places_nobody_but_itself() -> None:
+    lies = [link(LIAR, A, 1 << 30, 7.0), link(LIAR, B, 1 << 30, 1.0), link(LIAR, C, 1 << 30)]
+    placed = place_frames(lies)
+    assert [frame for frame in (A, B, C) if frame in placed and placed[frame][0] != LIAR] == [
+        frame for frame in (A, B, C) if frame in placed
+    ]
+    assert len(placed) == 2  # itself, and whom it claims to stand beside
+    honest = [link(A, B, 40, 3.0), link(B, A, 50, -3.0)]
+    with_lies = place_frames([*honest, *lies])
+    assert with_lies[B][1].tolist() == place_frames(honest)[B][1].tolist()
+    assert C not in with_lies or A not in with_lies or with_lies[C][0] != with_lies[A][0]
+
+
+def test_a_link_that_its_other_end_does_not_bear_out_is_but_a_claim() -> None:
+    joined = [link(B, A, 60, 1.0), link(A, B, 60, -1.0)]
+    one_sided = [*joined, link(C, FrameId(C.author, 1), 5), link(B, C, 900, 2.0)]
+    placed = place_frames(one_sided)
+    assert placed[C][0] == C and placed[B][0] == A  # b stands with a: it cannot draw c in
+    disputed = [*joined, link(B, C, 900, 2.0), link(C, B, 900, 2.0)]
+    disputed_placed = place_frames(disputed)
+    assert disputed_placed[B][0] == A and disputed_placed[C][1][4] == 3000  # c's own word on c
+    agreed = [*joined, link(B, C, 900, 2.0), link(C, B, 900, -2.0)]
+    assert place_frames(agreed)[C][0] == A
+
+
+def test_a_withdrawn_link_counts_no_more() -> None:
+    assert place_frames([link(B, A, 0, 1.0)]) == {}
+
+
+def test_a_contradiction_round_a_cycle_is_told() -> None:
+    def both(a: FrameId, b: FrameId, inliers: int, x: float) -> list[Link]:
+        return [link(a, b, inliers, x), link(b, a, inliers, -x)]
+
+    right = [*both(A, B, 90, 1.0), *both(B, C, 80, 1.0), *both(A, C, 70, 2.0)]
+    assert contradicted(right, place_frames(right)) == []
+    wrong = [*both(A, B, 90, 1.0), *both(B, C, 80, 1.0), *both(A, C, 70, 9.0)]
+    placed = place_frames(wrong)
+    assert [(lie.source, lie.target) for lie in contradicted(wrong, placed)] == [(A, C)]
+    assert placed[C][1][4] == -2000  # the better links decide
+
+
+def test_a_robot_says_nothing_about_frames_of_others() -> None:
+    """What a stranger signs about two others is left out."""
+    mallory, ann, bob = agent("mallory", UNKNOWN), agent("ann", UNKNOWN), agent("bob", UNKNOWN)
+    ends = [FrameId(robot.identity.author) for robot in (ann, bob)]
+    mallory.observing.relate([link(*ends, 1 << 30, 5.0)], False)
+    mallory.tick(0.0)
+    for out in mallory.outbox():
+        ann.receive(out.data, 0.0)
+    ann.digest()
+    assert ann.consensus.frames == {}
+
+
+@pytest.mark.parametrize("reach", [-1, 0, 900])
+def test_the_nearest_descriptors_are_the_nearest(reach: int) -> None:
+    from dagmap.kernels.hamming import NONE, nearest
+
+    rng = np.random.default_rng(reach + 1)
+    one, other = (rng.integers(0, 4, (n, 32)).astype(np.uint8) * 85 for n in (30, 40))
+    here, there = (rng.integers(0, 1000, (n, 3)).astype(np.int32) for n in (30, 40))
+    best, first, second = np.empty(30, np.int64), np.empty(30, np.int64), np.empty(30, np.int64)
+    back = np.empty(40, np.int64)
+    words = (d.view(np.int64).reshape(-1, 4) for d in (one, other))
+    nearest(*words, here, there, reach, best, first, second, back)
+    apart = np.unpackbits(one[:, None] ^ other[None], axis=2).sum(axis=2, dtype=np.int64)
+    if reach >= 0:
+        squared = ((here[:, None].astype(np.int64) - there[None]) ** 2).sum(axis=2)
+        apart[squared > reach * reach] = NONE
+    some, found = apart.min(axis=1) < NONE, apart.min(axis=0) < NONE
+    assert best.tolist() == np.where(some, apart.argmin(axis=1), -1).tolist()
+    assert back.tolist() == np.where(found, apart.argmin(axis=0), -1).tolist()
+    assert first.tolist() == np.sort(apart, axis=1)[:, 0].tolist()
+    assert second.tolist() == np.sort(apart, axis=1)[:, 1].tolist()
+
+
+def test_described_points_must_be_points() -> None:
+    from dagmap.payload import Payload, decode_payload, encode_payload
+    from dagmap.wire import Refusal
+
+    shown = Described(3, np.array([[1, 2, 3]], np.int32), np.zeros((1, 32), np.uint8))
+    data = encode_payload(Payload(described=(shown,)))
+    assert encode_payload(decode_payload(data, 2)) == data
+    for bad in (data[:1] + b"\x01\x03", data[:1] + bytes([data[1] - 1]) + data[2:-1]):
+        with pytest.raises(Refusal):
+            decode_payload(bad, 2)
+
+
+def test_descriptors_are_checked() -> None:
+    from dagmap import DagmapError
+
+    cycle = Cycle(0.0, np.eye(4), np.ones((3, 3)), descriptors=np.zeros((2, 32), np.uint8))
+    with pytest.raises(DagmapError, match=r"descriptors are uint8 \(2, 32\); \(3, 32\)"):
+        agent("ann").observe(cycle, 0.0)
+
+
+def test_fleets_of_robots_know_that_they_search() -> None:
+    fleet = Fleet(msgspec.structs.replace(UNKNOWN, placing=PlacingConfig(units_per_tick=1)))
+    cycles = {"ann": walk(room(1), names(1)), "bob": walk(room(1), names(1), STARTS["bob"], 1)}
+    busy: list[Robot] = []
+    for _ in fleet.run(cycles):
+        busy += [robot for robot in fleet.robots.values() if robot.agent.searching]
+    assert busy and not any(robot.agent.searching for robot in fleet.robots.values())
+    assert all(robot.agent.unplaced == {} for robot in fleet.robots.values())
