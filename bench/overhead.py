@@ -104,7 +104,7 @@ def against_size(most: int, n_c: int, others: int = 1) -> list[Row]:
     return rows
 
 
-def completion(n_c: int, v_th: int, count: int = 60) -> Row:
+def completion(n_c: int, v_th: int, count: int = 40) -> Row:
     """Cycles until a robot's map covers 95 % of a room that it looks at over and over."""
     rng = np.random.default_rng(4)
     wall = rng.uniform([2, -2, -1], [2.02, 2, 1], (4000, 3))
@@ -150,9 +150,9 @@ def run(most: int | None = None) -> list[Row]:
     most = most or int(os.environ.get("DAGMAP_BENCH_MOST", "1000000"))
     against_size(4000, 2)  # compiled and warm
     sizes = against_size(most, 2)
-    degrees = [row for n_c in range(2, 9) for row in against_size(min(most, 100_000), n_c)[-1:]]
-    fleets = [row for others in (1, 3, 7, 15, 31) for row in against_size(12_000, 2, others)[-1:]]
-    mapped = [completion(n_c, v_th) for v_th in (1, 3, 8) for n_c in range(2, 9, 2)]
+    degrees = [row for n_c in (2, 3, 4, 6, 8) for row in against_size(min(most, 10_000), n_c)[-1:]]
+    fleets = [row for others in (1, 3, 7, 15, 31) for row in against_size(3_000, 2, others)[-1:]]
+    mapped = [completion(n_c, v_th) for v_th in (1, 3, 8) for n_c in (2, 4, 8)]
     found = {"n_u": sizes, "n_c": degrees, "n_g": fleets, "completion": mapped}
     rows = [{"name": f"against {name}", **row} for name, part in found.items() for row in part]
     OUT.mkdir(parents=True, exist_ok=True)

@@ -65,9 +65,10 @@ class Issuance:
         self._period = config.issuance.cycle_period  # T, s
 
     def begin(self, now: float) -> None:
-        """A cycle of the SLAM begins; the time since the last one is taken for T."""
+        """A cycle of the SLAM begins; T is the time between two of them, smoothed."""
         if self._cycle_at is not None and now > self._cycle_at:
-            self._period = now - self._cycle_at
+            gap = now - self._cycle_at
+            self._period = 0.75 * self._period + 0.25 * gap if self._period else gap
         self._cycle_at = now
 
     def add(
