@@ -1,7 +1,7 @@
 """Section 5: what a cycle costs, measured, and as the paper's equations and DAGmap's own model
 predict it, against n(U), N_c and N_G; map completion against N_c and V_th; the cost of steering.
 
-Writes out/overhead/overhead.png and overhead.json beside the rows where matplotlib is installed.
+Writes out/overhead/overhead.json, and overhead.png where matplotlib is installed.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -25,6 +25,7 @@ from scenes import surface
 Row = dict[str, Any]
 FEATURES = 1000  # N_f: of a cycle
 LEARNT = 10_000  # n(U) up to which the models are fitted; beyond they predict
+WANTED = (1, 8, 64)  # V_th
 OUT = Path("out/overhead")
 
 
@@ -43,64 +44,76 @@ def cycles(count: int, seed: int = 1) -> Iterator[Cycle]:
 
 
 class Robot:
-    """An agent, what its cycles took of the processor, and both models as they learn."""
+    """An agent and what its cycles took of the processor."""
 
     def __init__(self, seed: int, n_c: int) -> None:
         self.agent = Agent(Identity.from_seed(bytes([seed]) * 32), config(n_c))
-        self.n_c, self.seconds = n_c, 0.0
-        self.models = {True: Model(True), False: Model(False)}
-        self.before = Work()
+        self.n_c, self.before = n_c, Work()
 
-    def work(self, cycle: Cycle | None, messages: list[bytes], now: float) -> list[bytes]:
-        """One cycle; returns what it sends."""
+    def work(self, cycle: Cycle, messages: list[bytes], now: float) -> tuple[list[bytes], Seen]:
+        """One cycle: what it sends, and what it cost."""
         started = time.process_time()
-        if cycle is not None:
-            self.agent.observe(cycle, now)
+        self.agent.observe(cycle, now)
         for message in messages:
             self.agent.receive(message, now)
         self.agent.tick(now)
-        self.seconds = time.process_time() - started
-        return [out.data for out in self.agent.outbox() if out.to is None]
-
-    def done(self) -> tuple[Work, Size]:
+        seconds = time.process_time() - started
         work = self.agent.steering.controller.work
-        step = work.since(self.before)
-        self.before = work.since(Work())
-        return step, Size(len(self.agent.observing.graph), self.n_c)
+        step, self.before = work.since(self.before), work.since(Work())
+        said = [out.data for out in self.agent.outbox() if out.to is None]
+        return said, Seen(step, Size(len(self.agent.observing.graph), self.n_c), seconds)
 
 
-def against_size(most: int, n_c: int, others: int = 1) -> list[Row]:
-    """S of a cycle at every n(U) passed: own features, and those of other robots merged."""
+class Seen(NamedTuple):
+    """A cycle of the robot that is watched."""
+
+    work: Work
+    size: Size
+    seconds: float
+
+
+def fly(most: int, n_c: int, others: int = 1) -> list[Seen]:
+    """Cycles of a robot that maps until n(U) = most, and merges what so many others map."""
     robots = [Robot(1 + i, n_c) for i in range(1 + others)]
-    streams = [cycles(most, 1 + i) for i in range(1 + others)]
-    wanted = [int(n) for n in np.geomspace(1000, most, 3 * len(str(most)) - 8)]
-    rows, window, said = [], [], [[] for _ in robots]  # type: ignore[var-annotated]
-    watched = robots[0]
-    for now, seen in enumerate(zip(*streams, strict=True)):
-        heard = [m for i, messages in enumerate(said) if i for m in messages]
+    said: list[list[bytes]] = [[] for _ in robots]
+    seen = []
+    for now, views in enumerate(
+        zip(*(cycles(most, 1 + i) for i in range(1 + others)), strict=True)
+    ):
+        heard = [message for messages in said[1:] for message in messages]
         for i, robot in enumerate(robots):
-            said[i] = robot.work(seen[i], heard if i == 0 else [], float(now))
-        step, size = watched.done()
-        if size.n_u <= LEARNT and now > 1:
-            for model in watched.models.values():
-                model.add(step, size, watched.seconds)
-        window.append(watched.seconds)
-        if wanted and size.n_u >= wanted[0]:
-            wanted = [n for n in wanted if n > size.n_u]
-            rows.append(
-                {
-                    "n_u": size.n_u,
-                    "n_c": n_c,
-                    "n_g": 1 + others,
-                    "measured_ms": 1e3 * float(np.median(window[-9:])),
-                    "own_ms": 1e3 * watched.models[True].own(step),
-                    "paper_printed_ms": 1e3 * watched.models[True].paper(step, size),
-                    "paper_meant_ms": 1e3 * watched.models[False].paper(step, size),
-                }
-            )
-    model = watched.models[True]
-    rows[-1] |= {"l_dist_ns": 1e9 * model.l_dist, "l_search_ns": 1e9 * model.l_search}
-    rows[-1] |= dict(zip(("insert_us", "send_us", "merge_us"), 1e6 * model.costs, strict=True))
+            said[i], cost = robot.work(views[i], heard if i == 0 else [], float(now))
+            if i == 0 and now:  # before there is nothing to merge
+                seen.append(cost)
+    return seen
+
+
+def predicted(flights: dict[tuple[int, int], list[Seen]], learn: Callable[..., bool]) -> list[Row]:
+    """A row for decades of n(U) of each flight (N_c, N_G), and what both models make of it.
+
+    learn: whether a cycle (n(U), N_c, N_G) is one that the models are fitted to.
+    """
+    models = {as_printed: Model(as_printed) for as_printed in (True, False)}
+    for (n_c, n_g), seen in flights.items():
+        for each in seen:
+            if learn(each.size.n_u, n_c, n_g):
+                for model in models.values():
+                    model.add(*each)
+    rows = []
+    for (n_c, n_g), seen in flights.items():
+        picks = np.unique(np.geomspace(1, len(seen), 10).astype(int) - 1)
+        for i in picks if len(flights) == 1 else [len(seen) - 1]:
+            work, size, _ = seen[i]
+            around = [each.seconds for each in seen[max(0, i - 4) : i + 5]]
+            row = {"n_u": size.n_u, "n_c": n_c, "n_g": n_g, "learnt": learn(size.n_u, n_c, n_g)}
+            row["measured_ms"] = 1e3 * float(np.median(around))
+            row["own_ms"] = 1e3 * models[True].own(work)
+            row["paper_printed_ms"] = 1e3 * models[True].paper(work, size)
+            row["paper_meant_ms"] = 1e3 * models[False].paper(work, size)
+            rows.append(row)
+    found = models[True]
+    rows[0] |= {"l_dist_ns": 1e9 * found.l_dist, "l_search_ns": 1e9 * found.l_search}
+    rows[0] |= dict(zip(("insert_us", "send_us", "merge_us"), 1e6 * found.costs, strict=True))
     return rows
 
 
@@ -148,12 +161,14 @@ def steering(period: float = 1.0, ticks: int = 20, count: int = 300) -> Row:
 def run(most: int | None = None) -> list[Row]:
     """Rows. n(U) goes up to 10^6, or to DAGMAP_BENCH_MOST (10^7 takes minutes and 3 GB)."""
     most = most or int(os.environ.get("DAGMAP_BENCH_MOST", "1000000"))
-    against_size(4000, 2)  # compiled and warm
-    sizes = against_size(most, 2)
-    degrees = [row for n_c in (2, 3, 4, 6, 8) for row in against_size(min(most, 10_000), n_c)[-1:]]
-    fleets = [row for others in (1, 3, 7, 15, 31) for row in against_size(3_000, 2, others)[-1:]]
-    mapped = [completion(n_c, v_th) for v_th in (1, 3, 8) for n_c in (2, 4, 8)]
-    found = {"n_u": sizes, "n_c": degrees, "n_g": fleets, "completion": mapped}
+    fly(4000, 2)  # compiled and warm
+    sizes = predicted({(2, 2): fly(most, 2)}, lambda n_u, n_c, n_g: n_u <= LEARNT)
+    degrees = {(n_c, 2): fly(min(most, 10_000), n_c) for n_c in (2, 3, 4, 6, 8)}
+    fleets = {(2, 1 + n): fly(4_000, 2, n) for n in (1, 3, 7, 15, 31)}
+    by_degree = predicted(degrees, lambda n_u, n_c, n_g: n_c <= 3)
+    by_fleet = predicted(fleets, lambda n_u, n_c, n_g: n_g <= 4)
+    mapped = [completion(n_c, v_th) for v_th in WANTED for n_c in (2, 4, 8)]
+    found = {"n_u": sizes, "n_c": by_degree, "n_g": by_fleet, "completion": mapped}
     rows = [{"name": f"against {name}", **row} for name, part in found.items() for row in part]
     OUT.mkdir(parents=True, exist_ok=True)
     (OUT / "overhead.json").write_text(json.dumps(found, indent=1) + "\n")
@@ -181,13 +196,14 @@ def draw(found: dict[str, list[Row]], path: Path) -> None:
             rows = found[key]
             x, y = [row[key] for row in rows], [row[column] for row in rows]
             axis.plot(x, y, style, color=color, label=name, markersize=3)
-        axis.set_yscale("log")
-        if key != "n_c":
-            axis.set_xscale("log")
+        axis.set_yscale("log" if key == "n_u" else "linear")
+        axis.set_xscale("log" if key == "n_u" else "linear")
+        if key != "n_u":
+            axis.set_ylim(bottom=0)
         axis.set_title(f"S of a cycle of {FEATURES} features, ms")
         axis.set_xlabel(title)
     axes[0, 0].legend()
-    for v_th in (1, 3, 8):
+    for v_th in WANTED:
         rows = [row for row in found["completion"] if row["v_th"] == v_th]
         x, y = [row["n_c"] for row in rows], [row["cycles_to_95"] for row in rows]
         axes[1, 1].plot(x, y, "o-", label=f"V_th = {v_th}")
