@@ -335,7 +335,7 @@ class Agent:
             events.append(Revoked(author, count))
         for tx in outcome.accepted:
             self._fold(tx)
-            if tx.author != self.identity.author:
+            if tx.author != self.identity.author and not again:
                 self.steering.controller.merged(tx.features)
             events.append(Accepted(tx.id, tx.data))
         if outcome.missing is not None:
