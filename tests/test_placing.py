@@ -285,6 +285,71 @@ def test_an_agent_that_starts_again_goes_on(three: dict[str, Agent]) -> None:
     assert again.digest() == ann.digest() and again.unplaced == {}
 
 
+def silent(start: Points = STARTS["bob"]) -> dict[str, Agent]:
+    """Ann and bob have shown each other their described points, and published no link."""
+    never = msgspec.structs.replace(UNKNOWN.placing, inliers=1 << 20)
+    mute = msgspec.structs.replace(UNKNOWN, placing=never)
+    places, described = room(1), names(1)
+    return meet(mute, ann=walk(places, described), bob=walk(places, described, start, 1))
+
+
+def issues(robot: Agent, calls: int) -> bool:
+    return any(type(e).__name__ == "Issued" for at in range(calls) for e in robot.tick(float(at)))
+
+
+def test_a_robot_that_listens_for_its_own_chain_signs_no_link() -> None:
+    """It may have been told already, with a number that the copy of the ledger does not know."""
+    ann = silent()["ann"]
+    again = Agent.restore(ann.identity, UNKNOWN, [tx.data for tx in ann.ledger])
+    again.listening = True
+    assert not issues(again, 20)
+    again.listening = False
+    again.resume()
+    assert issues(again, 20)
+
+
+def test_described_points_beyond_all_reach_are_no_reason_to_stop() -> None:
+    """Who repeats a robot's described points a thousand kilometres away offers it a frame that no
+    pose can tell of."""
+    ann, bob = agent("ann", UNKNOWN), agent("bob", UNKNOWN)
+    far, further = np.eye(4), np.array([3e8, 3e8, 4e8])
+    far[:3, 3] = 500_000.0
+    for cycle in walk(room(1), names(1)):
+        ann.observe(cycle, cycle.stamp)
+        bob.observe(replace(cycle, pose=far @ np.asarray(cycle.pose)), cycle.stamp)
+    held = bob.observing._keyframes._held
+    for at, (keyframe, cycle) in enumerate(zip(held, walk(room(1), names(1)), strict=True)):
+        offset = (further @ np.asarray(cycle.pose)[:3, :3]).astype(np.int32)
+        held[at] = replace(keyframe, position=keyframe.position + offset)
+    bob.observing.relate([], True)
+    bob.tick(10.0)
+    for out in bob.outbox():
+        ann.receive(out.data, 10.0)
+    for at in range(20):
+        ann.tick(11.0 + at)
+    assert ann.unplaced[FrameId(bob.identity.author)] == "it lies beyond 2^29 mm"
+
+
+def test_a_link_that_is_a_thousandth_off_a_rotation_is_an_answer_like_others() -> None:
+    """The quaternion of a foreign pose may be off by so much (docs/protocol.md)."""
+    half = pose(3, -2, 1, np.pi)
+    pair = silent(half)
+    low, high = sorted(pair.values(), key=lambda robot: robot.identity.author)
+    slow = msgspec.structs.replace(UNKNOWN.placing, units_per_tick=1)
+    config = msgspec.structs.replace(UNKNOWN, placing=slow)
+    again = Agent.restore(high.identity, config, [tx.data for tx in high.ledger])
+    again.tick(0.0)
+    truth = half if low.config.name == "ann" else np.linalg.inv(half)
+    ends = FrameId(low.identity.author), FrameId(high.identity.author)
+    short = quantise_pose(truth)
+    short[:4] = (short[:4] * 0.99952).astype(np.int32)
+    low.observing.relate([Link(*ends, short, 500)], True)
+    low.tick(100.0)
+    for out in low.outbox():
+        again.receive(out.data, 100.0)
+    assert issues(again, 100) and again.unplaced == {}
+
+
 A, B, C, LIAR = (FrameId(bytes([n]) * 8) for n in (1, 2, 3, 9))
 
 

@@ -75,6 +75,7 @@ class Agent:
         self.observing = Observing(self.config, identity.author, identity.salt)
         self.sync = Sync(self.ledger, self.config, identity.author)
         self.placing = Placing(self.config.placing, identity.author)
+        self.listening = False  # to be told of its own chain first: nothing is issued meanwhile
         self._outbox: list[Outgoing] = []
         self._map: WorldMap | None = None
         self._map_version = -1  # of the consensus, when the map was made
@@ -236,7 +237,7 @@ class Agent:
     @property
     def unplaced(self) -> dict[FrameId, str]:
         """SLAM frames that no links lead to from this robot's, and why: they wait, unmerged."""
-        self._advance()
+        self._catch_up()
         return self.placing.why(self.consensus)
 
     @property
@@ -271,7 +272,7 @@ class Agent:
         """Section 4.2: seal what is valid and may go out, and take it through the door."""
         events: list[Event] = []
         me = self.identity.author
-        if self._silenced:
+        if self.listening or self._silenced:
             return events
         for payload in self.observing.payloads(now, self.ledger.features(me)):
             main = self.ledger.chain(me).main

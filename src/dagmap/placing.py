@@ -20,8 +20,11 @@ import numpy as np
 
 from .config import PlacingConfig
 from .consensus import Consensus
+from .frames import IDENTITY_POSE
+from .kernels.geometry import compose
 from .ledger import Ledger
 from .model import (
+    LIMIT_MM,
     MAX_KEYFRAMES,
     AuthorId,
     Floats,
@@ -201,6 +204,9 @@ class _Relation:
             said = _inverse(_matrix(self.answer.pose))
             if best.evidence.apart(said, pose) <= self._config.tolerance_mm / 2:
                 pose = said
+        if np.abs(pose[:3, 3]).max() >= LIMIT_MM:
+            self.reason = "it lies beyond 2^29 mm"
+            return self._withdraw()
         return self._publish(pose, best.evidence)
 
     def _publish(self, pose: Floats, evidence: Evidence) -> Link | None:
@@ -370,8 +376,8 @@ def _views(keyframes: list[_Keyframe]) -> Views:
 
 
 def _matrix(pose: Int32s) -> Floats:
-    """(4, 4) mm of a (7,) pose."""
-    out = pose_matrix(pose)
+    """(4, 4) mm of a (7,) pose, whose quaternion may be off by a thousandth."""
+    out = pose_matrix(compose(pose, np.array(IDENTITY_POSE, np.int32)))
     out[:3, 3] *= 1000.0
     return out
 
