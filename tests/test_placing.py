@@ -11,12 +11,17 @@ import msgspec
 import numpy as np
 import pytest
 
+from chains import Author as ChainAuthor
+from chains import anchor
 from dagmap import Agent, Config, Cycle
 from dagmap.config import PlacingConfig, load_config
+from dagmap.consensus import Consensus
 from dagmap.frames import contradicted, place_frames
+from dagmap.ledger import Ledger
 from dagmap.messages import Transactions, encode
-from dagmap.model import FrameId, pose_matrix, quantise_pose
-from dagmap.payload import Described, Link
+from dagmap.model import MAX_KEYFRAMES, FrameId, pose_matrix, quantise_pose
+from dagmap.payload import Described, Link, Payload
+from dagmap.placing import Placing
 from dagmap.sim.fleet import Fleet
 from dagmap.sim.robot import Robot
 from scene import QUICK, agent, pose
@@ -350,6 +355,55 @@ def test_a_link_that_is_a_thousandth_off_a_rotation_is_an_answer_like_others() -
     assert issues(again, 100) and again.unplaced == {}
 
 
+def test_keyframes_of_anchors_that_never_come_keep_nobody_elses_out() -> None:
+    mallory, bob = ChainAuthor("mallory", UNKNOWN), silent()["bob"]
+    ledger = Ledger(UNKNOWN)
+    junk = tuple(
+        Described(cycle, np.zeros((1, 3), np.int32), np.zeros((1, 32), np.uint8))
+        for cycle in range(MAX_KEYFRAMES)
+    )
+    for tx in [mallory.make(payload=Payload(described=junk)), *bob.ledger]:
+        ledger.add(tx)
+    for order in (sorted, lambda chains: sorted(chains, reverse=True)):
+        ledger.chains = {author: ledger.chains[author] for author in order(ledger.chains)}
+        placing = Placing(UNKNOWN.placing, bob.identity.author)
+        placing._take_in(ledger, Consensus(UNKNOWN))  # as in a revision: no anchor is known yet
+        placing._take_in(ledger, bob.consensus)
+        assert sum(map(len, placing._keyframes.values())) == 12
+
+
+def test_a_robot_that_started_often_is_still_placed() -> None:
+    """Each session shows keyframes; the oldest ones make room for those of the newest."""
+    robot, chain, ledger = ChainAuthor("often", UNKNOWN), [], Ledger(UNKNOWN)
+    one = (np.zeros((1, 3), np.int32), np.zeros((1, 32), np.uint8))
+    for session in range(5):
+        cycles = range(100 * session, 100 * session + 100)
+        anchors = tuple(replace(anchor(cycle), session=session) for cycle in cycles)
+        shown = tuple(Described(cycle, *one) for cycle in cycles)
+        chain.append(robot.make(payload=Payload(anchors=anchors, described=shown)))
+    consensus, placing = Consensus(UNKNOWN), Placing(UNKNOWN.placing, robot.identity.author)
+    for tx in chain:
+        ledger.add(tx)
+        consensus.add(tx)
+    placing._take_in(ledger, consensus)
+    held = {frame.session: len(keyframes) for frame, keyframes in placing._keyframes.items()}
+    assert held[4] == 100 and sum(held.values()) <= MAX_KEYFRAMES
+    assert {frame.session for ends in placing._relations for frame in ends} == set(held)
+
+
+def test_a_link_that_was_withdrawn_can_be_published_anew() -> None:
+    """Also while its own withdrawal is not in the ledger yet."""
+    ann = silent()["ann"]
+    again = Agent.restore(ann.identity, UNKNOWN, [tx.data for tx in ann.ledger])
+    assert issues(again, 20)
+    (relation,) = again.placing._relations.values()
+    before = relation.published
+    assert before is not None and relation._withdraw() is not None
+    again.placing._hear(relation, again.consensus)
+    anew = relation._conclude()
+    assert anew is not None and anew.inliers > 0
+
+
 A, B, C, LIAR = (FrameId(bytes([n]) * 8) for n in (1, 2, 3, 9))
 
 
@@ -380,6 +434,27 @@ def test_a_link_that_its_other_end_does_not_bear_out_is_but_a_claim() -> None:
     assert disputed_placed[B][0] == A and disputed_placed[C][1][4] == 3000  # c's own word on c
     agreed = [*joined, link(B, C, 900, 2.0), link(C, B, 900, -2.0)]
     assert place_frames(agreed)[C][0] == A
+
+
+def test_who_places_itself_beside_others_is_not_their_origin() -> None:
+    """Else a stranger with a low id would turn everybody's map, and anew with each link."""
+    low = FrameId(bytes(7) + b"\x01")
+    honest = [link(A, B, 40, 3.0), link(B, A, 50, -3.0)]
+    before, after = place_frames(honest), place_frames([*honest, link(low, B, 1 << 30, 7.0)])
+    assert after[low][0] == A
+    assert [(after[f][0], after[f][1].tolist()) for f in (A, B)] == [
+        (before[f][0], before[f][1].tolist()) for f in (A, B)
+    ]
+    alone = place_frames([link(low, B, 1 << 30, 7.0)])
+    assert alone[B][0] == alone[low][0] == B
+
+
+def test_a_claim_binds_its_target_to_nothing() -> None:
+    """B still places itself beside a robot that is gone, whoever claims to stand beside B."""
+    claim = link(B, A, 60, 1.0)
+    alone, with_lie = place_frames([claim]), place_frames([claim, link(LIAR, B, 1 << 30, 7.0)])
+    assert with_lie[B][0] == alone[B][0] == A
+    assert with_lie[B][1].tolist() == alone[B][1].tolist() and with_lie[LIAR][0] == A
 
 
 def test_a_withdrawn_link_counts_no_more() -> None:
@@ -433,7 +508,7 @@ def test_the_nearest_descriptors_are_the_nearest(reach: int) -> None:
 
 
 def test_described_points_must_be_points() -> None:
-    from dagmap.payload import Payload, decode_payload, encode_payload
+    from dagmap.payload import decode_payload, encode_payload
     from dagmap.wire import Refusal
 
     shown = Described(3, np.array([[1, 2, 3]], np.int32), np.zeros((1, 32), np.uint8))

@@ -319,8 +319,9 @@ class Consensus:
         self.frames, self._links_changed = place_frames(links), False
         frames = before.keys() | self.frames.keys()
         moved = {f for f in frames if not _alike(before.get(f), self.frames.get(f))}
-        for author in (self.authors.get(id_) for id_ in {frame.author for frame in moved}):
-            for cycle, keys in author.seen_in.items() if author is not None else ():
+        authors = {frame.author for frame in moved} & self.authors.keys()
+        for author in (self.authors[id_] for id_ in authors):
+            for cycle, keys in author.seen_in.items():
                 anchor = author.anchors.get(cycle)
                 if anchor is not None and FrameId(author.id, anchor.session) in moved:
                     self._restale(keys)

@@ -88,6 +88,7 @@ class _Relation:
         self.here: list[_Keyframe] = []
         self.there: list[_Keyframe] = []
         self.candidates: list[_Candidate] = []
+        self.resumed = False  # whether it was seen what an earlier run of this robot has published
         self.published: Link | None = None  # by this robot
         self._weight = 0.0  # of the evidence for it
         self.answer: Link | None = None  # by the other end
@@ -236,7 +237,7 @@ class Placing:
     def __init__(self, config: PlacingConfig, me: AuthorId) -> None:
         self._config, self._me = config, me
         self._read: dict[AuthorId, int] = {}  # transactions of each chain that were looked at
-        self._waiting: list[tuple[AuthorId, Described]] = []  # their anchors are not known yet
+        self._waiting: dict[AuthorId, list[Described]] = {}  # their anchors are not known yet
         self._keyframes: dict[FrameId, list[_Keyframe]] = {}
         self._relations: dict[tuple[FrameId, FrameId], _Relation] = {}
         self._turn = 0
@@ -286,36 +287,44 @@ class Placing:
                 self._forget(author)
                 read = 0
             for tx in chain.main[read : chain.end]:
-                self._waiting += [(author, keyframe) for keyframe in tx.payload.described]
+                self._waiting.setdefault(author, []).extend(tx.payload.described)
             self._read[author] = chain.end
-        waiting, self._waiting = self._waiting, []
-        for author, keyframe in waiting:
-            self._enter(author, keyframe, consensus)
+        for author, waiting in self._waiting.items():
+            late = [
+                keyframe for keyframe in waiting if not self._enter(author, keyframe, consensus)
+            ]
+            self._waiting[author] = late[:MAX_KEYFRAMES]
         self._follow(consensus)
 
     def _forget(self, author: AuthorId) -> None:
         """A fork or a revocation has cut a chain: begin anew with its author."""
-        self._waiting = [(id_, k) for id_, k in self._waiting if id_ != author]
+        self._waiting.pop(author, None)
         for frame in [frame for frame in self._keyframes if frame.author == author]:
-            del self._keyframes[frame]
-        for ends in [
-            ends for ends in self._relations if author in (ends[0].author, ends[1].author)
-        ]:
+            self._drop(frame)
+
+    def _drop(self, frame: FrameId) -> None:
+        del self._keyframes[frame]
+        for ends in [ends for ends in self._relations if frame in ends]:
             del self._relations[ends]
 
-    def _enter(self, author: AuthorId, keyframe: Described, consensus: Consensus) -> None:
+    def _enter(self, author: AuthorId, keyframe: Described, consensus: Consensus) -> bool:
+        """Compare from now on; where the author has too many, instead of its oldest session.
+
+        False: its anchor is not known yet.
+        """
         known = consensus.authors.get(author)
         anchor = None if known is None else known.anchors.get(keyframe.cycle)
         if anchor is None:
-            if len(self._waiting) < MAX_KEYFRAMES:
-                self._waiting.append((author, keyframe))
-            return
+            return False
         frame = FrameId(author, anchor.session)
-        count = sum(len(k) for f, k in self._keyframes.items() if f.author == author)
-        if count >= MAX_KEYFRAMES:
-            return
+        theirs = [f for f in self._keyframes if f.author == author]
+        if sum(len(self._keyframes[f]) for f in theirs) >= MAX_KEYFRAMES:
+            if min(theirs) >= frame:
+                return True
+            self._drop(min(theirs))
         self._keyframes.setdefault(frame, []).append(_Keyframe(author, keyframe, anchor.pose))
         self._relate(frame)
+        return True
 
     def _relate(self, frame: FrameId) -> None:
         """Every own frame against every other one; of two own ones the later one is the source."""
@@ -358,9 +367,10 @@ class Placing:
     def _hear(self, relation: _Relation, consensus: Consensus) -> None:
         """What both ends have published so far."""
         ends = relation.source, relation.target
-        mine = consensus.author(self._me).links.get(ends)
-        if relation.published is None and mine is not None and 0 < mine.inliers < CERTAIN:
-            relation.published = mine  # by an earlier run of this robot
+        mine = None if relation.resumed else consensus.author(self._me).links.get(ends)
+        if mine is not None and 0 < mine.inliers < CERTAIN:
+            relation.published = mine
+        relation.resumed = True
         theirs = consensus.authors.get(relation.target.author)
         answer = None if theirs is None else theirs.links.get((relation.target, relation.source))
         relation.answer = answer if answer is not None and answer.inliers else None
