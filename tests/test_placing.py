@@ -290,6 +290,18 @@ def test_an_agent_that_starts_again_goes_on(three: dict[str, Agent]) -> None:
     assert again.digest() == ann.digest() and again.unplaced == {}
 
 
+def test_a_link_follows_a_loop_closure() -> None:
+    """Nothing new is seen; all that bob has seen moves."""
+    places, described = room(1), names(1)
+    seen, shift = walk(places, described, STARTS["bob"], 1), pose(5.0, 3.0, 0.0, 1.0)
+    poses = np.stack([shift @ np.asarray(cycle.pose) for cycle in seen])
+    stamps = [cycle.stamp for cycle in seen]
+    closure = Cycle(20.0, poses[-1], np.zeros((0, 3)), moved=(stamps, poses))
+    agents = meet(ann=walk(places, described), bob=[*seen, closure])
+    metres, degrees = off(relative(agents, "ann", "bob"), STARTS["ann"], shift @ STARTS["bob"])
+    assert metres < 0.03 and degrees < 0.3
+
+
 def silent(start: Points = STARTS["bob"]) -> dict[str, Agent]:
     """Ann and bob have shown each other their described points, and published no link."""
     never = msgspec.structs.replace(UNKNOWN.placing, inliers=1 << 20)

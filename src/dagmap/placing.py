@@ -14,7 +14,7 @@ contradict each other and are both believable are an ambiguity: then none is pub
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from .config import PlacingConfig
 from .consensus import Consensus
 from .frames import IDENTITY_POSE
 from .kernels.geometry import compose
+from .keyframes import Keyframe, views
 from .ledger import Ledger
 from .model import (
     LIMIT_MM,
@@ -30,12 +31,11 @@ from .model import (
     Floats,
     FrameId,
     Int32s,
-    Uint8s,
     pose_matrix,
     quantise_pose,
 )
 from .payload import CERTAIN, Described, Link
-from .registration import Evidence, Views, judge, match, register, rivals
+from .registration import Evidence, Views, inverse, judge, match, register, rivals
 
 PAIRED = 6  # described points of two keyframes that agree: enough for a proposal
 GROWTH = 2  # a link is published again once what agrees fixes it so much better
@@ -46,37 +46,12 @@ _JUDGING = 12  # units: what judging a proposal costs, beside comparing two keyf
 
 
 @dataclass(slots=True, eq=False)
-class _Keyframe:
-    """A foreign or own keyframe, carried into its SLAM frame by the newest pose of its anchor."""
-
-    author: AuthorId
-    described: Described
-    pose: Int32s  # (7,) of the anchor
-    place: Floats = field(init=False)  # (4, 4) mm
-    points: Floats = field(init=False)  # (N, 3) mm in the SLAM frame
-    depth: float = field(init=False)  # mm, median distance of a point from the sensor
-
-    def __post_init__(self) -> None:
-        self.depth = float(np.median(np.linalg.norm(self.described.position, axis=1)))
-        self.move(self.pose)
-
-    def move(self, pose: Int32s) -> None:
-        self.pose, self.place = pose, pose_matrix(pose)
-        self.place[:3, 3] *= 1000.0
-        turned = self.described.position @ self.place[:3, :3].T
-        self.points = np.asarray(turned + self.place[:3, 3])
-
-    @property
-    def descriptors(self) -> Uint8s:
-        return self.described.descriptors
-
-
-@dataclass(slots=True, eq=False)
 class _Candidate:
     """A proposal that was judged."""
 
     pose: Floats  # (4, 4) mm, source into target
     evidence: Evidence
+    between: Floats | None  # (4, 4) mm the same from the one to the other keyframe that agree best
     seen: int  # keyframes of both frames when it was judged
 
 
@@ -85,8 +60,8 @@ class _Relation:
 
     def __init__(self, config: PlacingConfig, source: FrameId, target: FrameId) -> None:
         self._config, self.source, self.target = config, source, target
-        self.here: list[_Keyframe] = []
-        self.there: list[_Keyframe] = []
+        self.here: list[Keyframe] = []
+        self.there: list[Keyframe] = []
         self.candidates: list[_Candidate] = []
         self.resumed = False  # whether it was seen what an earlier run of this robot has published
         self.published: Link | None = None  # by this robot
@@ -102,7 +77,7 @@ class _Relation:
         while True:
             if self.answer is not None and self.answer is not self._answered:
                 self._answered = self.answer
-                yield from self._propose(_inverse(_matrix(self.answer.pose)))
+                yield from self._propose(inverse(_matrix(self.answer.pose)))
             pair = next(pairs)
             if pair is None:
                 yield from self._improve()
@@ -112,7 +87,7 @@ class _Relation:
             if proposal is not None and not self._known(proposal):
                 yield from self._propose(proposal)
 
-    def _pairs(self) -> Iterator[tuple[_Keyframe, _Keyframe] | None]:
+    def _pairs(self) -> Iterator[tuple[Keyframe, Keyframe] | None]:
         """Every pair of keyframes once, also of those that come later; None while there is none."""
         a = b = 0
         while True:
@@ -127,7 +102,7 @@ class _Relation:
             else:
                 yield None
 
-    def _compare(self, one: _Keyframe, other: _Keyframe) -> Floats | None:
+    def _compare(self, one: Keyframe, other: Keyframe) -> Floats | None:
         rows = match(one.descriptors, other.descriptors)
         if len(rows) < PAIRED:
             return None
@@ -143,6 +118,15 @@ class _Relation:
     def _same(self, pose: Floats, known: _Candidate) -> bool:
         return known.evidence.apart(pose, known.pose) <= 4 * self._config.tolerance_mm
 
+    def judge_anew(self) -> None:
+        """Keyframes have moved, and what was proposed with them: it is to be judged again."""
+        for known in self.candidates:
+            known.seen = 0
+            if known.between is not None:
+                (i, j), *_ = known.evidence.best
+                back = inverse(self.here[i].place)
+                known.pose = self.there[j].place @ known.between @ back
+
     def _improve(self) -> Iterator[tuple[int, Link | None]]:
         """Judge again what was proposed, once there is much more to judge it by."""
         for known in self.candidates[:]:
@@ -154,7 +138,7 @@ class _Relation:
 
     def _propose(self, pose: Floats) -> Iterator[tuple[int, Link | None]]:
         """Judge a proposal and its rivals; at last the link to publish, if there is news."""
-        here, there = _views(self.here), _views(self.there)
+        here, there = views(self.here), views(self.there)
         candidate = self._judge(here, there, pose)
         if self._holds(candidate):
             for rival in rivals(here, there, candidate.evidence, self._config.tolerance_mm):
@@ -168,7 +152,12 @@ class _Relation:
         evidence = judge(here, there, pose, self._config.tolerance_mm)
         alike = [c for c in self.candidates if self._same(evidence.pose, c)]
         self.candidates = [c for c in self.candidates if c not in alike]
-        alike.append(_Candidate(evidence.pose, evidence, len(here.points) + len(there.points)))
+        between = None
+        if evidence.best:
+            (i, j), *_ = evidence.best
+            between = inverse(there.poses[j]) @ evidence.pose @ here.poses[i]
+        seen = len(here.points) + len(there.points)
+        alike.append(_Candidate(evidence.pose, evidence, between, seen))
         best = max(alike, key=lambda c: c.evidence.inliers)  # a bad start may end up beside it
         self.candidates.append(best)
         self.candidates.sort(key=lambda c: (not self._holds(c), -c.evidence.inliers))
@@ -202,7 +191,7 @@ class _Relation:
             return self._withdraw()
         pose = best.pose
         if self.answer is not None and self.target < self.source:  # the lower one's pose counts
-            said = _inverse(_matrix(self.answer.pose))
+            said = inverse(_matrix(self.answer.pose))
             if best.evidence.apart(said, pose) <= self._config.tolerance_mm / 2:
                 pose = said
         if np.abs(pose[:3, 3]).max() >= LIMIT_MM:
@@ -238,7 +227,7 @@ class Placing:
         self._config, self._me = config, me
         self._read: dict[AuthorId, int] = {}  # transactions of each chain that were looked at
         self._waiting: dict[AuthorId, list[Described]] = {}  # their anchors are not known yet
-        self._keyframes: dict[FrameId, list[_Keyframe]] = {}
+        self._keyframes: dict[FrameId, list[Keyframe]] = {}
         self._relations: dict[tuple[FrameId, FrameId], _Relation] = {}
         self._turn = 0
         self.busy = False  # whether the last step found something to compare
@@ -322,7 +311,7 @@ class Placing:
             if min(theirs) >= frame:
                 return True
             self._drop(min(theirs))
-        self._keyframes.setdefault(frame, []).append(_Keyframe(author, keyframe, anchor.pose))
+        self._keyframes.setdefault(frame, []).append(Keyframe(author, keyframe, anchor.pose))
         self._relate(frame)
         return True
 
@@ -340,12 +329,16 @@ class Placing:
                     self._relations[source, target] = relation
 
     def _follow(self, consensus: Consensus) -> None:
-        for keyframes in self._keyframes.values():
+        for frame, keyframes in self._keyframes.items():
+            anchors, far = consensus.authors[frame.author].anchors, False
             for keyframe in keyframes:
-                anchors = consensus.authors[keyframe.author].anchors
                 anchor = anchors.get(keyframe.described.cycle)
                 if anchor is not None and anchor.pose is not keyframe.pose:
                     keyframe.move(anchor.pose)
+                    far |= keyframe.went_beyond(self._config.tolerance_mm / 2)
+            for relation in self._relations.values() if far else ():
+                if frame in (relation.source, relation.target):
+                    relation.judge_anew()
 
     def _search(self, consensus: Consensus) -> list[Link]:
         """Spend this tick's units on the relations in turn."""
@@ -376,24 +369,8 @@ class Placing:
         relation.answer = answer if answer is not None and answer.inliers else None
 
 
-def _views(keyframes: list[_Keyframe]) -> Views:
-    return Views(
-        np.array([keyframe.place for keyframe in keyframes]),
-        [keyframe.points for keyframe in keyframes],
-        [keyframe.descriptors for keyframe in keyframes],
-        float(np.median([keyframe.depth for keyframe in keyframes])) if keyframes else 0.0,
-    )
-
-
 def _matrix(pose: Int32s) -> Floats:
     """(4, 4) mm of a (7,) pose, whose quaternion may be off by a thousandth."""
     out = pose_matrix(compose(pose, np.array(IDENTITY_POSE, np.int32)))
     out[:3, 3] *= 1000.0
-    return out
-
-
-def _inverse(pose: Floats) -> Floats:
-    out = np.eye(4)
-    out[:3, :3] = pose[:3, :3].T
-    out[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
     return out
