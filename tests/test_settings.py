@@ -66,7 +66,7 @@ class TestFile:
         bounds = [f"ledger.{key}" for key in config.ledger.__struct_fields__]
         network = config.network.__struct_fields__
         bounds += [f"network.{key}" for key in network if "bytes" in key or "messages" in key]
-        assert set(bounds) <= rows.keys() and len(bounds) == 9
+        assert set(bounds) <= rows.keys() and len(bounds) == 10
 
 
 class TestMistakes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 import io
 import json
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -17,7 +18,7 @@ import numpy as np
 import pytest
 
 import dagmap.io.sources
-from dagmap.io.sources import open_source, save_cycles
+from dagmap.io.sources import Options, describe_source, open_source, save_cycles
 from dagmap.model import (
     ConfigError,
     Cycle,
@@ -265,7 +266,6 @@ POSE = "0 0 0 0 0 0 1\n"
 BROKEN: dict[str, tuple[Callable[[Path], None], str]] = {
     "no depth": (remove("depth"), "no folder depth/"),
     "no pictures": (remove("rgb"), "no folder rgb/"),
-    "no poses": (remove("groundtruth.txt"), "groundtruth.txt: missing"),
     "no camera": (remove("camera.json"), "camera.json.*--camera FILE"),
     "no picture": (remove("rgb/1.5.png"), "rgb/1.5.png: missing.*associations.txt, line 3"),
     "no depth picture": (remove("depth/2.0.png"), "depth/2.0.png: missing.*line 4"),
@@ -340,14 +340,54 @@ def test_broken_lists(folder: Path, change: Callable[[Path], None], message: str
     assert str(folder) in str(caught.value)
 
 
+def test_pictures_alone_suffice(tmp_path: Path) -> None:
+    """Without poses by odometry, beside the poses that the recording came with."""
+    walk = tmp_path / "walk"
+    shutil.copytree(OFFICE / "robot1", walk)
+    lines = (walk / "associations.txt").read_text().splitlines()
+    (walk / "associations.txt").write_text("\n".join(lines[:10]) + "\n")
+    truth = list(open_source(walk))
+    (walk / "groundtruth.txt").unlink()
+    source = open_source(walk)
+    assert describe_source(walk).notes == ("no groundtruth.txt: odometry by OpenCV",)
+    found = list(source)
+    assert len(found) == len(truth) == 10
+    first: dict[int, np.ndarray] = {}  # what each session's frame is in the recording's
+    for mine, theirs in zip(found, truth, strict=True):
+        assert np.array_equal(mine.points, theirs.points)
+        pose, wanted = np.asarray(mine.pose), np.asarray(theirs.pose)
+        placed = first.setdefault(mine.session, wanted @ np.linalg.inv(pose)) @ pose
+        assert np.linalg.norm(placed[:3, 3] - wanted[:3, 3]) < 0.15
+    assert len(first) <= 3
+    again = list(source)
+    assert all(np.array_equal(a.pose, b.pose) for a, b in zip(found, again, strict=True))
+
+
+def test_where_nothing_is_known_again_a_session_begins(folder: Path) -> None:
+    """The three pictures have nothing in common."""
+    (folder / "groundtruth.txt").unlink()
+    found = list(open_source(folder))
+    assert [cycle.session for cycle in found] == [0, 1, 2]
+    assert all(np.array_equal(cycle.pose, np.eye(4)) for cycle in found)
+
+
+def test_damaged_pictures_are_left_out_where_that_is_asked_for(folder: Path) -> None:
+    (folder / "depth" / "1.5.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    with pytest.raises(RecordingError, match=r"1.5.png: .*--keep-going leaves it out"):
+        list(open_source(folder))
+    source = open_source(folder, Options(keep_going=True))
+    assert [cycle.stamp for cycle in source] == [1.0, 2.0]
+    assert len(source.skips.told) == 1  # type: ignore[attr-defined]
+
+
 def test_what_is_no_recording(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="gone: there is no such"):
         open_source(tmp_path / "gone")
     with pytest.raises(RecordingError, match="TUM RGB-D folder.*npz|npz.*TUM RGB-D folder"):
         open_source(tmp_path)
-    (tmp_path / "walk.bag").write_text("")
-    with pytest.raises(RecordingError, match="walk.bag: not a recording"):
-        open_source(tmp_path / "walk.bag")
+    (tmp_path / "walk.txt").write_text("")
+    with pytest.raises(RecordingError, match="walk.txt: not a recording"):
+        open_source(tmp_path / "walk.txt")
 
 
 def test_a_third_reader_is_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -110,7 +110,7 @@ def _robot() -> None:
     config = load_config(_FILE)
     assert len(config.fleet_id) == len(config.parameters_id) == 8
     assert config.graph.pitch_mm > 0 and config.fold.cell_mm > 0 and config.fold.delta_mm > 0
-    assert config.fold.max_ray_mm >= 0
+    assert config.fold.max_ray_mm >= 0 and config.placing.tolerance_mm > 0
     assert config.fold.support_mm >= 2 * config.fold.delta_mm
     Agent(ROBOTS[0], config)
 
@@ -202,7 +202,7 @@ def _written(config: Config) -> bytes:
 
 PARSERS = {
     "dagmap.config": (),
-    "dagmap.io.settings": (),
+    "dagmap.io.settings": ("SourceConfig.options",),
     "dagmap.sim.scenario": (),
     "dagmap.sim.building": ("!SceneConfig*",),
     "dagmap.sim.sensor": ("!SensorConfig*",),

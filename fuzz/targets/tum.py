@@ -69,8 +69,10 @@ def run(data: bytes) -> bool:
     try:
         if not tum.matches(folder):
             return False
-        source = tum.open(folder, Options(max_features=50, max_depth=10.0))
-        cycles = list(source)
+        for keep_going in (True, False):
+            options = Options(max_features=50, max_depth=10.0, keep_going=keep_going)
+            source = tum.open(folder, options)
+            cycles = list(source)
     except DagmapError as error:
         assert str(folder) in str(error) and "\n" not in str(error)
         return False

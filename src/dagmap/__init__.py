@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from .model import Issued as Issued
     from .model import MapChanged as MapChanged
     from .model import Outgoing as Outgoing
+    from .model import Overloaded as Overloaded
     from .model import Reason as Reason
     from .model import Rejected as Rejected
     from .model import Revoked as Revoked
@@ -51,6 +52,7 @@ _HOME = {
         "Issued",
         "MapChanged",
         "Outgoing",
+        "Overloaded",
         "Reason",
         "Rejected",
         "Revoked",

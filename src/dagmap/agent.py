@@ -15,7 +15,7 @@ from . import checkpoint as checkpoints
 from . import messages
 from .config import Config
 from .consensus import Consensus
-from .identity import Identity, certificate_holds
+from .identity import Identity, check_certificate
 from .ledger import Ledger
 from .messages import Heads, Message, Transactions
 from .model import (
@@ -23,7 +23,6 @@ from .model import (
     Accepted,
     AuthorId,
     Bools,
-    ConfigError,
     Cycle,
     Event,
     Floats,
@@ -42,7 +41,9 @@ from .model import (
 )
 from .observing import Observing
 from .placing import Placing
-from .sync import Post, Sync
+from .shaping import Urgency
+from .steering import Steering
+from .sync import Sync
 from .transaction import Transaction, glance, id_of, parse, seal
 from .wire import Refusal
 from .worldmap import WorldMap, build_map
@@ -69,14 +70,14 @@ class Agent:
         self.config = config or Config()
         self._parsers = parsers or Parsers()
         self.identity = identity
-        _check_certificate(identity, self.config)
+        check_certificate(identity, self.config)
         self.ledger = Ledger(self.config)
         self.consensus = Consensus(self.config, identity.salt)
         self.observing = Observing(self.config, identity.author, identity.salt)
         self.sync = Sync(self.ledger, self.config, identity.author)
         self.placing = Placing(self.config.placing, identity.author)
+        self.steering = Steering(self.config, identity.author)
         self.listening = False  # to be told of its own chain first: nothing is issued meanwhile
-        self._outbox: list[Outgoing] = []
         self._map: WorldMap | None = None
         self._map_version = -1  # of the consensus, when the map was made
         self._undone = self._applied = 0  # transactions, since the last `MapChanged`
@@ -102,7 +103,6 @@ class Agent:
         for data in transactions:
             agent._through_the_door(data, again=True)
         agent.resume()
-        agent._outbox.clear()
         return agent
 
     def resume(self) -> None:
@@ -124,8 +124,11 @@ class Agent:
         quantised = self.observing.check(quantise_cycle(cycle))
         self.observing.withdraw(quantised)  # what the SLAM removed or moved
         self.observing.rearrange()
-        self.observing.insert(quantised, now, self._settled)  # what it added: Alg. 1
-        return self._issue(now)
+        # what it added: Alg. 1
+        events = self.steering.insert(self.observing, quantised, now, self._settled)
+        events += self._issue(now)
+        self.steering.shaper.release(now)
+        return events
 
     def receive(self, data: bytes, now: float) -> list[Event]:
         """Take any message of any robot. Foreign bytes never raise: they are `Rejected`."""
@@ -135,13 +138,15 @@ class Agent:
             return [Rejected(refusal.reason, refusal.fault, refusal.detail)]
         if isinstance(message, Transactions):
             events = [e for item in message.data for e in self._through_the_door(item)]
-            self._post(self.sync.answered(sender, message, now))
-            return events
-        if isinstance(message, Heads):
-            self._post(self.sync.heard(sender, message, now))
+            self.steering.post(self.sync.answered(sender, message, now), Urgency.CONTROL)
+        elif isinstance(message, Heads):
+            events = []
+            self.steering.post(self.sync.heard(sender, message, now), Urgency.CONTROL)
         else:
-            self._post(self.sync.asked(sender, message))
-        return []
+            events, room = [], self.steering.shaper.room_for_answer(sender)
+            self.steering.post(self.sync.asked(sender, message, room), Urgency.ANSWER)
+        self.steering.shaper.release(now)
+        return events
 
     def take(self, data: bytes) -> list[Event]:
         """Take one transaction from elsewhere than the network, as a revocation out of a file.
@@ -157,16 +162,25 @@ class Agent:
         among them, so it is asked for again much later.
         """
         self.observing.rearrange()
-        events = self._issue(now)
+        self.steering.look(self.sync, now)
+        events = self.steering.catch_up(self.observing, now, self._settled)
+        events += self._issue(now)
         events += self._advance(self.config.ledger.fold_per_tick)
         self.observing.relate(*self.placing.step(self.ledger, self.consensus))
-        self._post(self.sync.tick(now, unread))
+        self.steering.announce(self.sync.tick(now, unread), now)
+        self.steering.shaper.release(now)
         return events
 
+    def took(self, seconds: float) -> None:
+        """Say what the calls since the last time took of the processor.
+
+        Without being told, the agent cannot keep S < T (`overhead.cycle_share`): it has no clock.
+        """
+        self.steering.controller.took(seconds)
+
     def outbox(self) -> list[Outgoing]:
-        """What is to be sent, handed over and forgotten."""
-        out, self._outbox = self._outbox, []
-        return out
+        """What is to be sent now, handed over and forgotten."""
+        return self.steering.shaper.take()
 
     def digest(self) -> bytes:
         """32 bytes over the map of all that is accepted; equal on two robots exactly when their
@@ -186,7 +200,7 @@ class Agent:
     @property
     def holds_back(self) -> bool:
         """Whether something that is valid still waits to be issued (the next ticks do it)."""
-        return self.observing.waiting and not self._silenced
+        return (self.observing.waiting or self.steering.shaper.waiting) and not self._silenced
 
     @property
     def searching(self) -> bool:
@@ -268,13 +282,20 @@ class Agent:
             return np.zeros(len(points), np.bool_)
         return self.consensus.settled(*self._frame, points, repeats)
 
+    def _known(self, points: Int32s) -> Bools:
+        """Points (N, 3) mm in the SLAM frame where the fleet's map has a node."""
+        return self.consensus.settled(*self._frame, points, 0)
+
     def _issue(self, now: float) -> list[Event]:
         """Section 4.2: seal what is valid and may go out, and take it through the door."""
         events: list[Event] = []
         me = self.identity.author
-        if self.listening or self._silenced:
+        quiet = self.listening or self._silenced
+        allowed = None if quiet else self.steering.allowance(now)
+        if allowed is None:
             return events
-        for payload in self.observing.payloads(now, self.ledger.features(me)):
+        base = self.ledger.features(me)
+        for payload in self.observing.payloads(now, base, allowed, self._known):
             main = self.ledger.chain(me).main
             previous = main[-1].id if main else None
             tips = self.ledger.tips(me, self.config.transaction.max_references)
@@ -287,7 +308,8 @@ class Agent:
             if id_of(data) not in self.ledger:
                 break  # a Rejected event above says why; numbering on would fork the chain
             events.append(Issued(id_of(data), payload.features, bundles, len(data)))
-            self._post([(Transactions((data,)), None)])
+            self.steering.controller.issued(payload.features, len(data))
+            self.steering.post([(Transactions((data,)), None)], Urgency.OWN)
         return events
 
     def _through_the_door(self, data: bytes, again: bool = False) -> list[Event]:
@@ -315,6 +337,8 @@ class Agent:
             events.append(Revoked(author, count))
         for tx in outcome.accepted:
             self._fold(tx)
+            if tx.author != self.identity.author and not again:
+                self.steering.controller.merged(tx.features)
             events.append(Accepted(tx.id, tx.data))
         if outcome.missing is not None:
             events.append(Waiting(transaction.id, outcome.missing))
@@ -364,34 +388,3 @@ class Agent:
         if self._map is None or self._map_version != consensus.version:
             return False
         return consensus.revising or self._map.origin == self._component
-
-    def _post(self, posts: Iterable[Post]) -> None:
-        me = self.identity.author
-        for message, to in posts:
-            self._outbox.append(Outgoing(messages.encode(message, self.config, me), to))
-
-
-def _check_certificate(identity: Identity, config: Config) -> None:
-    """In a closed fleet a robot without its certificate would be heard by nobody."""
-    certificate, remedy = identity.certificate, "enroll the robot (dagmap keys enroll)"
-    if not config.closed:
-        return
-    if certificate is None:
-        raise ConfigError(
-            f"Config: fleet_key closes the fleet {config.fleet!r}, but {identity} has no "
-            f"certificate; {remedy} and load its folder"
-        )
-    holds = certificate_holds(
-        certificate, config.fleet_public_key, config.fleet_id, identity.public_key
-    )
-    if not holds:
-        raise ConfigError(
-            f"Config: the certificate of {identity} is not one of the fleet {config.fleet!r} with "
-            f"fleet_key = {config.fleet_key!r}; {remedy} in that fleet, or correct both keys"
-        )
-    name = identity.name
-    if config.name not in ("", name):
-        raise ConfigError(
-            f"Config: name = {config.name!r}, but the certificate names the robot {name!r}; "
-            "leave the name out"
-        )

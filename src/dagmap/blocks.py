@@ -98,7 +98,8 @@ class Fold(Protocol):
 
     def settled(self, author: int, xyz: Int32s, repeats: int) -> Bools:
         """(N,) places (N, 3) mm of which the author has said all that counts: it said so
-        `repeats` times, or once where as many authors as confirm a node say the same."""
+        `repeats` times, or once where as many authors as confirm a node say the same; with 0
+        repeats, those that have a node."""
 
     def evaluate(self, rays: RayEvidence) -> Verdict:
         """Hits, misses, witnesses and states of all nodes."""

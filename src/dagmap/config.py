@@ -82,12 +82,18 @@ class IssuanceConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=
     features_per_second: float | None = None  # the robot's budget; None: as fast as they are valid
     repeats: int = 16  # how often a robot says that it saw one place; 0: every time
     seal_period: float = 0.25  # s between transactions under a budget, so that envelopes stay few
+    spread_from: float = (
+        2.0  # s: what a cycle that lasts so long makes valid goes out spread over it
+    )
+    cycle_period: float = 0.0  # s that a cycle is taken to last until two were seen
 
     def __post_init__(self) -> None:
         self._require_range("features_per_bundle", 1, 1 << 20)
         self._require_range("features_per_transaction", 1, 1400)
         self._require_range("seal_period", 0.0, 3600.0)
         self._require_range("repeats", 0, 1 << 30)
+        self._require_range("spread_from", 0.0, 1e9)
+        self._require_range("cycle_period", 0.0, 3600.0)
         if self.features_per_second is not None:
             self._require_range("features_per_second", 0.1, 1e9)
 
@@ -175,6 +181,29 @@ class SyncConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True
         self._require_range("chunk_bytes", 1 << 16, 1 << 30)
 
 
+class OverheadConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Section 5: what DAGmap may cost. Without a limit nothing is held back or left for later."""
+
+    fleet_bytes_per_second: float | None = None  # C_Th of Eq. (6), shared by the robots in reach
+    robot_bytes_per_second: float | None = None  # cap on all that this robot sends
+    cycle_share: float | None = None  # of the cycle time T that the overhead S may take, Eq. (2)
+    longest_delay: float = 1.0  # s one way: a slower link carries too much; used with a byte limit
+    backlog: int = 1_000_000  # points that wait to be inserted at most; the oldest are dropped
+
+    def __post_init__(self) -> None:
+        for name in ("fleet_bytes_per_second", "robot_bytes_per_second"):
+            if getattr(self, name) is not None:
+                self._require_range(name, 500.0, 1e12)
+        if self.cycle_share is not None:
+            self._require_range("cycle_share", 0.01, 1.0)
+        self._require_range("longest_delay", 0.01, 3600.0)
+        self._require_range("backlog", 1, 1 << 30)
+
+    @property
+    def caps_bytes(self) -> bool:
+        return not (self.fleet_bytes_per_second is None and self.robot_bytes_per_second is None)
+
+
 class PlacingConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How robots that share no frame find each other's. A robot's own policy, see docs/placing.md.
 
@@ -234,6 +263,7 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     ledger: LedgerConfig = LedgerConfig()
     sync: SyncConfig = SyncConfig()
     placing: PlacingConfig = PlacingConfig()
+    overhead: OverheadConfig = OverheadConfig()
 
     def __post_init__(self) -> None:
         fits = len(self.name.encode()) <= MAX_NAME

@@ -19,7 +19,8 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import (
     Ed25519PublicKey,
 )
 
-from .model import MAX_NAME, AuthorId
+from .config import Config
+from .model import MAX_NAME, AuthorId, ConfigError
 
 _CERTIFIED = b"dagmap certificate 1\0"
 
@@ -97,3 +98,32 @@ def certificate_holds(
     name, signature = certificate[:-64], certificate[-64:]
     message = _CERTIFIED + fleet_id + public_key + name
     return bool(name) and signature_holds(fleet_key, signature, message)
+
+
+def check_certificate(identity: Identity, config: Config) -> None:
+    """Raises ConfigError where the fleet is closed and the identity has no certificate of it.
+
+    Such a robot would be heard by nobody.
+    """
+    certificate, remedy = identity.certificate, "enroll the robot (dagmap keys enroll)"
+    if not config.closed:
+        return
+    if certificate is None:
+        raise ConfigError(
+            f"Config: fleet_key closes the fleet {config.fleet!r}, but {identity} has no "
+            f"certificate; {remedy} and load its folder"
+        )
+    holds = certificate_holds(
+        certificate, config.fleet_public_key, config.fleet_id, identity.public_key
+    )
+    if not holds:
+        raise ConfigError(
+            f"Config: the certificate of {identity} is not one of the fleet {config.fleet!r} with "
+            f"fleet_key = {config.fleet_key!r}; {remedy} in that fleet, or correct both keys"
+        )
+    name = identity.name
+    if config.name not in ("", name):
+        raise ConfigError(
+            f"Config: name = {config.name!r}, but the certificate names the robot {name!r}; "
+            "leave the name out"
+        )

@@ -6,7 +6,10 @@ cycle that saw it, its place in that cycle's sensor frame and its colour.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -15,6 +18,22 @@ from .graph import AdjacencyDag
 from .kernels.columns import distinct, grown
 from .model import Bools, Int32s, Int64s, Uint8s
 from .payload import Bundle, Sighting
+
+_PART = 1.0  # s between the parts in which a long cycle goes out
+_WORTH = 64  # features below which a part is not worth its envelope
+_LOOK = 8  # times what may go out that is looked at for news
+ROOM = 50_000  # bytes of records in a transaction at most
+ALL = 1 << 40  # more features than there are
+Known: TypeAlias = Callable[[Int32s], Bools]  # of points (N, 3) mm in the SLAM frame
+
+
+@dataclass(frozen=True, slots=True)
+class Allowance:
+    """What may go out now, as traffic and load have it (section 5)."""
+
+    features: int = ALL
+    per_bundle: int = ALL  # N'_f: what a bundle holds at most
+    room: int = ROOM  # bytes of records in a transaction
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,6 +61,15 @@ class Issuance:
         self._allowance = 0.0
         self._last: float | None = None
         self._sealed_at: float | None = None
+        self._cycle_at: float | None = None
+        self._period = config.issuance.cycle_period  # T, s
+
+    def begin(self, now: float) -> None:
+        """A cycle of the SLAM begins; T is the time between two of them, smoothed."""
+        if self._cycle_at is not None and now > self._cycle_at:
+            gap = now - self._cycle_at
+            self._period = 0.75 * self._period + 0.25 * gap if self._period else gap
+        self._cycle_at = now
 
     def add(
         self, nodes: Int64s, cycle: Int32s, place: Int32s, color: Uint8s, colored: Bools
@@ -82,10 +110,14 @@ class Issuance:
         """Whether valid features have not gone out yet."""
         return bool(self._open(self._ripe).any())
 
-    def batch(self, now: float) -> Batch | None:
-        """What may go out now, or None. Marks it as issued; the caller must send it."""
-        limit = self._limit(now)
-        nodes = self._take(limit) if limit > 0 else np.zeros(0, np.int64)
+    def batch(self, now: float, allowed: Allowance, known: Known) -> Batch | None:
+        """What may go out now, or None. Marks it as issued; the caller must send it.
+
+        known: tells which places the fleet's map has. Where not all fits, they come last.
+        """
+        limit = min(self._limit(now), self._part(now), allowed.features)
+        per_bundle = min(self._config.issuance.features_per_bundle, allowed.per_bundle)
+        nodes = self._take(limit, per_bundle, known) if limit > 0 else np.zeros(0, np.int64)
         sightings = self._sightings() if limit > 0 else ()
         if len(nodes) == 0 and not sightings:
             return None
@@ -118,7 +150,7 @@ class Issuance:
         """How many features may go out: Eq. (6) as a rate, spread evenly over time."""
         rate = self._config.issuance.features_per_second
         if rate is None:
-            return 1 << 40
+            return ALL
         elapsed = 0.0 if self._last is None else max(0.0, now - self._last)
         self._last = now
         self._allowance = min(self._allowance + elapsed * rate, max(rate, 1.0))
@@ -127,18 +159,38 @@ class Issuance:
             return 0
         return int(self._allowance)
 
-    def _take(self, limit: int) -> Int64s:
+    def _part(self, now: float) -> int:
+        """How many features may go out if those of a long cycle are spread over it."""
+        if self._cycle_at is None or self._period < max(self._config.issuance.spread_from, _PART):
+            return ALL
+        if self._sealed_at is not None and now - self._sealed_at < _PART:
+            return 0
+        waiting = np.count_nonzero(self._open(self._ripe))
+        parts = max(1, round((self._cycle_at + self._period - now) / _PART))
+        return max(_WORTH, math.ceil(waiting / parts)) if waiting else ALL
+
+    def _take(self, limit: int, per_bundle: int, known: Known) -> Int64s:
         """Cores, newest first, each with its unissued ascendants, until the limit is reached."""
         if len(self._ripe) == 0:
             return self._ripe
-        per_bundle = self._config.issuance.features_per_bundle
         cores = self._ripe[self._open(self._ripe)]
         cores = distinct(cores)[::-1]
+        if len(cores) > limit:
+            cores = self._news_first(cores, limit, known)
         taken, frontier, done, changed = self.graph.take(cores, per_bundle, limit)
         self._ripe = cores[done:]
         self._ripen(frontier)  # the nearest truncated inherit the core's validity (5.2)
         self.revalue(changed)
         return taken
+
+    def _news_first(self, cores: Int64s, limit: int, known: Known) -> Int64s:
+        """What is new to the fleet before what repeats, each newest first.
+
+        Looks at as many of the newest as find `limit` news, and at no more than a few times that.
+        """
+        looked = cores[: _LOOK * limit]
+        repeats = known(self.graph.positions(looked))
+        return np.concatenate([looked[~repeats], cores[len(looked) :], looked[repeats]])
 
     def _open(self, nodes: Int64s) -> Bools:
         return np.asarray(self.graph.alive(nodes) & ~self.graph.issued(nodes))

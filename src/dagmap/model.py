@@ -381,7 +381,24 @@ class MapChanged:
     applied: int
 
 
-Event: TypeAlias = Accepted | Rejected | Waiting | Issued | Forked | Revoked | MapChanged
+@dataclass(frozen=True, slots=True)
+class Overloaded:
+    """The overhead S came too near to the cycle time T, so fewer features are inserted a cycle.
+
+    The others wait for a quieter time. load: S / T of the cycle. features: that a cycle inserts
+    from now on, None where all are inserted again. waiting: points that are left for later;
+    dropped: points for which there was no room (`overhead.backlog`).
+    """
+
+    load: float
+    features: int | None
+    waiting: int
+    dropped: int = 0
+
+
+Event: TypeAlias = (
+    Accepted | Rejected | Waiting | Issued | Forked | Revoked | MapChanged | Overloaded
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,9 +10,10 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from .backlog import Backlog, Seen
 from .config import Config
 from .graph import AdjacencyDag
-from .issuance import Issuance
+from .issuance import ROOM, Allowance, Issuance, Known
 from .kernels.codec import morton_order
 from .kernels.columns import distinct, grown
 from .kernels.geometry import apply_pose
@@ -32,9 +33,10 @@ from .payload import CERTAIN, Anchor, Link, Payload, Sighting
 from .transaction import Transaction
 
 Settled: TypeAlias = Callable[[Int32s], Bools]  # of points (N, 3) mm in the SLAM frame
-_ROOM = 50_000  # bytes of records in a transaction; below, what each costs at most
+_LEFT = -2  # node of an id whose point is left for later; -1: it has none for other reasons
 _REARRANGED = 2048  # nodes that leave the DAG, or come back elsewhere, in one call
 _MOST_MOVED, _MOST_RETRACTED = 1024, 16_384  # that go out in one call
+# Bytes that each costs at most in a transaction
 _FEATURE, _PARENT, _ANCHOR, _NUMBER, _SIGHTING = 22, 6, 48, 6, 16
 NONE = np.zeros(0, np.int64)
 
@@ -56,6 +58,7 @@ class Observing:
         self._keyframes = Keyframes(config.placing)
         self._introduced = config.closed  # there the certificate names the robot
         self._earlier: list[Issuance] = []  # of former sessions, with features held back
+        self.backlog = Backlog(config.overhead.backlog)
         self._start_frame()
 
     def _start_frame(self) -> None:
@@ -120,6 +123,8 @@ class Observing:
             nodes = np.sort(np.array(list(map(self._nodes.pop, cycle.removed.tolist())), np.int64))
             self._leaving.append(nodes[nodes >= 0])  # others were thrown out of range by a move
         moved = [Anchor(self._cycle_of[s], self.session, s, pose) for s, pose in cycle.moved]
+        for anchor in moved:
+            self.backlog.move(anchor.cycle, anchor.pose)
         self._moved += moved
         self._moving += moved
 
@@ -151,39 +156,67 @@ class Observing:
         del self._moving[:done]
         self._reinsert(batch)
 
-    def insert(self, cycle: QuantisedCycle, now: float, settled: Settled) -> None:
+    def insert(
+        self, cycle: QuantisedCycle, now: float, settled: Settled, limit: int | None = None
+    ) -> None:
         """Algorithm 1 for every new feature of the cycle, in the order of a Z curve.
 
         settled: tells which points the map knows well enough; these are left out.
+        limit: how many are inserted now; the others are left for later (`catch_up`).
         """
         number, self.cycles = self.cycles, self.cycles + 1
         self._sessions[cycle.session] = cycle.stamp
         self._cycle_of[cycle.stamp] = number
         self._publish(Anchor(number, cycle.session, cycle.stamp, cycle.pose), now)
+        self.issuance.begin(now)
         self.observed += len(cycle.points)
         self._keyframes.see(number, cycle)
         order = morton_order(cycle.points)
         if cycle.ids is not None:
             order = self._first_seen(cycle.ids, order, number)
-        positions = _carry(cycle.pose, cycle.points[order])[0]
-        fresh = ~settled(positions)
-        if cycle.ids is not None:
-            self._nodes.update(dict.fromkeys(cycle.ids[order[~fresh]].tolist(), -1))
-        order = order[fresh]
-        place = cycle.points[order]
+        seen = Seen(number, cycle.pose, cycle.points, cycle.ids, cycle.colors).rows(order)
+        if limit is not None and len(order) > limit:
+            seen, rest = seen.split(limit)
+            if rest.ids is not None:
+                self._nodes.update(dict.fromkeys(rest.ids.tolist(), _LEFT))
+            self.backlog.add(rest)
+        self._append(seen, settled)
+
+    def catch_up(self, settled: Settled, limit: int) -> int:
+        """Insert what was left for later, `limit` points at most. Returns how many were looked at.
+
+        What the SLAM has removed meanwhile, or seen again and inserted, is left out.
+        """
+        looked = 0
+        for seen in self.backlog.take(limit):
+            looked += len(seen.points)
+            if seen.ids is not None:
+                still = [self._nodes.get(id_) == _LEFT for id_ in seen.ids.tolist()]
+                seen = seen.rows(np.array(still, np.bool_))
+            self._append(seen, settled)
+        return looked
+
+    def _append(self, seen: Seen, settled: Settled) -> None:
+        positions, inside = _carry(seen.pose, seen.points)
+        fresh = inside & ~settled(positions)
+        if seen.ids is not None:
+            self._nodes.update(dict.fromkeys(seen.ids[~fresh].tolist(), -1))
+        seen = seen.rows(fresh)
+        count = len(seen.points)
         nodes = self.graph.insert(positions[fresh])
-        if cycle.ids is not None and len(nodes):
+        if seen.ids is not None and len(nodes):
             self._id_of = grown(self._id_of, int(nodes[-1]) + 1, 0)
-            self._id_of[nodes] = cycle.ids[order]
-        color = np.zeros((len(place), 3), np.uint8) if cycle.colors is None else cycle.colors[order]
-        colored = np.full(len(place), cycle.colors is not None, np.bool_)
-        self.issuance.add(nodes, np.full(len(place), number, np.int32), place, color, colored)
-        if cycle.ids is not None:
-            self._nodes.update(zip(cycle.ids[order].tolist(), nodes.tolist(), strict=True))
+            self._id_of[nodes] = seen.ids
+        color = np.zeros((count, 3), np.uint8) if seen.colors is None else seen.colors
+        colored = np.full(count, seen.colors is not None, np.bool_)
+        cycle = np.full(count, seen.cycle, np.int32)
+        self.issuance.add(nodes, cycle, seen.points, color, colored)
+        if seen.ids is not None:
+            self._nodes.update(zip(seen.ids.tolist(), nodes.tolist(), strict=True))
 
     def node_of(self, id_: int) -> int:
         """The node of an id that the SLAM gave; -1 where it is unknown or has left."""
-        return self._nodes.get(id_, -1)
+        return max(self._nodes.get(id_, -1), -1)
 
     def relate(self, links: Iterable[Link], wanted: bool) -> None:
         """Publish links of the robot's own frames; and its described points, where `wanted`."""
@@ -198,18 +231,23 @@ class Observing:
     @property
     def waiting(self) -> bool:
         """Whether something is to be sent sooner or later."""
-        if self._anchors or self._moved or self._links or self._retracted:
+        if self._anchors or self._moved or self._links or self._retracted or len(self.backlog):
             return True
         if self.rearranging or self._keyframes.due:
             return True
         return any(issuance.waiting for issuance in (*self._earlier, self.issuance))
 
-    def payloads(self, now: float, base: int) -> Iterator[Payload]:
-        """What goes out now, cut so that each payload fits into a transaction."""
+    def payloads(
+        self, now: float, base: int, allowed: Allowance, known: Known
+    ) -> Iterator[Payload]:
+        """What goes out now, cut so that each payload fits into a transaction.
+
+        known: tells which places the fleet's map has.
+        """
         while self._earlier and not self._earlier[0].waiting:
             self._earlier.pop(0)
         issuance = self._earlier[0] if self._earlier else self.issuance
-        batch = issuance.batch(now)
+        batch = issuance.batch(now, allowed, known)
         if batch is None and not self._due(now):
             return
         nodes = NONE if batch is None else batch.nodes
@@ -224,15 +262,17 @@ class Observing:
         name = None if self._introduced else self._config.name or None
         self._introduced = True
         while anchors or links or name or len(retracted) or sightings or len(nodes) or described:
-            room = _ROOM - 64 * len(links)
+            room = max(allowed.room - 64 * len(links), _ANCHOR)
             mine = anchors[: room // _ANCHOR]
             room -= len(mine) * _ANCHOR
             gone = retracted[: room // _NUMBER]
             room -= len(gone) * _NUMBER
             again, sightings, room = _fill(sightings, room)
-            shown, described, room = fill(described, room)
+            alone = not (mine or again or len(gone) or len(nodes))
+            shown, described, room = fill(described, ROOM if alone else room)
             each = _FEATURE + _PARENT * self._config.graph.n_p
-            count = min(room // each, self._config.issuance.features_per_transaction)
+            count = max(room // each, 1)
+            count = min(count, self._config.issuance.features_per_transaction)
             bundle = issuance.bundle(nodes[:count], base) if len(nodes[:count]) else None
             yield Payload(name, tuple(mine), bundle, gone, again, links, described=shown)
             base += len(nodes[:count])
@@ -251,6 +291,7 @@ class Observing:
         before = FrameId(self._author, self.session)
         if self._sessions:
             self.rearrange(1 << 40)
+            self.catch_up(_nothing, len(self.backlog))
             if self.issuance.waiting:
                 self._earlier.append(self.issuance)
             self._start_frame()
@@ -321,6 +362,10 @@ class Observing:
         ids = self._id_of[nodes[nodes < len(self._id_of)]].tolist()
         named = zip(nodes.tolist(), ids, strict=False)
         return {node: id_ for node, id_ in named if self._nodes.get(id_) == node}
+
+
+def _nothing(points: Int32s) -> Bools:
+    return np.zeros(len(points), np.bool_)
 
 
 def _carry(pose: Int32s, points: Int32s) -> tuple[Int32s, Bools]:

@@ -22,6 +22,9 @@ MAX_PEERS = 256  # senders are not authenticated here, so their number must be b
 _MAX_HEADS = 1800  # of one message, and of what is kept of a peer
 _MAX_IDS = 256  # of one question
 _ROOM = MAX_MESSAGE - 64  # for transactions in a message
+_SMALL = 2048  # bytes for transactions in a message of a robot whose traffic is capped
+_LIVE = 5  # announcement periods without a word after which a robot counts as gone
+_LATE = 3  # announcement periods that an echo may take before that means something
 _UNREAD = 8  # retry periods that an answer gets on top while messages wait to be read
 Post = tuple[Message, AuthorId | None]
 
@@ -34,6 +37,15 @@ class Peer:
     token: int = 0
     heard: float = 0.0
     delay: float | None = None  # s, one way, smoothed
+    echo: Echo | None = None  # the last one
+
+
+class Echo(NamedTuple):
+    """A token that came back."""
+
+    token: int
+    delay: float  # s, one way
+    at: float  # s: when it came, less how long the other held it
 
 
 class Asked(NamedTuple):
@@ -86,6 +98,7 @@ class Sync:
         for whose, token, kept in message.echoes:
             if whose == self._me and token in self._sent_at:
                 delay = max(0.0, now - self._sent_at[token] - kept / 1e6) / 2
+                peer.echo = Echo(token, delay, now - kept / 1e6)
                 peer.delay = delay if peer.delay is None else 0.75 * peer.delay + 0.25 * delay
         yield from self._ask(sender, peer, now)
 
@@ -109,17 +122,39 @@ class Sync:
         heads = (peer.heads.get(author) for peer in self.peers.values())
         return any(head is not None and self._wanted(head, {}) is not None for head in heads)
 
-    def asked(self, sender: AuthorId, message: Want) -> Iterator[Post]:
-        """Answer a question, up to `chunk_bytes`."""
+    def live(self, now: float) -> dict[AuthorId, Peer]:
+        """The robots that were heard of late."""
+        since = now - _LIVE * self._config.announce_period
+        return {author: peer for author, peer in self.peers.items() if peer.heard >= since}
+
+    def delay(self, now: float) -> float | None:
+        """What a message from here takes at least, s one way; None where nobody knows.
+
+        Measured by the tokens that the others echo; where none came back for long, by how long.
+        That of the nearest robot: a slow link of another one is not this one's to relieve.
+        """
+        period = self._config.announce_period
+        echoes = [peer.echo for peer in self.live(now).values() if peer.echo is not None]
+        if not echoes:
+            return None
+        last = max(echo.token for echo in echoes)
+        fresh = [echo.delay for echo in echoes if echo.token > last - _LIVE]
+        unechoed = self._sent_at.get(last + 1, now)
+        overdue = (now - unechoed - _LATE * period) / 2
+        return max(min(fresh), overdue)
+
+    def asked(self, sender: AuthorId, message: Want, room: int | None = None) -> Iterator[Post]:
+        """Answer a question, up to `chunk_bytes`, or `room` bytes where these are fewer."""
+        most = self._config.chunk_bytes if room is None else min(room, self._config.chunk_bytes)
         found: list[bytes] = []
         size, more = 0, False
-        for data in self._found(message):
+        for data in self._found(message) if most > 0 else ():
             size += len(data)
-            if size > self._config.chunk_bytes:
+            if size > most and found:
                 more = True
                 break
             found.append(data)
-        packed = list(_packed(found))
+        packed = list(_packed(found, _ROOM if room is None else min(_ROOM, _SMALL)))
         for i, data_ in enumerate(packed):
             yield Transactions(data_, more and i == len(packed) - 1), sender
 
@@ -242,12 +277,12 @@ def _tip(id_: bytes) -> bytes:
     return id_[:8].ljust(8, b"\0")
 
 
-def _packed(data: Iterable[bytes]) -> Iterator[tuple[bytes, ...]]:
-    """As many transactions as fit into each message."""
+def _packed(data: Iterable[bytes], room: int) -> Iterator[tuple[bytes, ...]]:
+    """As many transactions as fit into each message of `room` bytes, at least one."""
     batch: list[bytes] = []
     size = 0
     for item in data:
-        if batch and size + len(item) + 9 > _ROOM:
+        if batch and size + len(item) + 9 > room:
             yield tuple(batch)
             batch, size = [], 0
         batch.append(item)

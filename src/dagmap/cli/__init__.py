@@ -19,6 +19,17 @@ app = typer.Typer(
 app.add_typer(keys, name="keys")
 
 
+_MaxDepth = Annotated[float | None, typer.Option(help="Points beyond are dropped, m.")]
+_Topic = Annotated[
+    list[str] | None, typer.Option(help="Of a bag: a topic to use; may be repeated.")
+]
+_Frame = Annotated[str | None, typer.Option(help="Of a bag with tf: the frame that stands still.")]
+_SameFrame = Annotated[bool, typer.Option(help="Poses are the sensor's, whatever frames say.")]
+_Poses = Annotated[Path | None, typer.Option(help="File of poses beside clouds: TUM or KITTI.")]
+_Voxel = Annotated[float, typer.Option(help="Of a cloud one point a voxel is kept, m.")]
+_KeepGoing = Annotated[bool, typer.Option(help="Leave out what cannot be read.")]
+
+
 def _version(wanted: bool) -> None:
     if wanted:
         typer.echo(f"dagmap {__version__}")
@@ -37,7 +48,8 @@ def _root(
 @app.command()
 def replay(
     recordings: Annotated[
-        list[Path], typer.Argument(help="One per robot: a TUM RGB-D folder or a cycle stream .npz.")
+        list[Path],
+        typer.Argument(help="One per robot: a bag, a folder, a cycle stream; see docs/formats.md."),
     ],
     out: Annotated[Path, typer.Option(help="Folder for the results; it must be empty.")],
     config: Annotated[Path | None, typer.Option(help="TOML file of parameters.")] = None,
@@ -47,7 +59,14 @@ def replay(
         typer.Option(help="A robot that joins at the end and copies the map; may be repeated."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the simulated network.")] = 0,
-    max_features: Annotated[int, typer.Option(help="ORB features a frame at most.")] = 1000,
+    max_features: Annotated[int, typer.Option(help="Points a frame gives at most.")] = 1000,
+    max_depth: _MaxDepth = None,
+    topic: _Topic = None,
+    frame: _Frame = None,
+    same_frame: _SameFrame = False,
+    poses: _Poses = None,
+    voxel: _Voxel = 0.1,
+    keep_going: _KeepGoing = False,
     camera: Annotated[
         Path | None, typer.Option(help="camera.json to use instead of the folder's own.")
     ] = None,
@@ -61,23 +80,39 @@ def replay(
     json: Annotated[bool, typer.Option("--json", help="Print summary.json, no table.")] = False,
 ) -> None:
     """Play recordings through one agent each and write the map on which they agree."""
+    from ..io.sources import Options
     from .replay import Replay
 
-    raise typer.Exit(
-        Replay(
-            recordings,
-            out,
-            config,
-            loss,
-            late or [],
-            seed,
-            max_features,
-            camera,
-            unknown_frames,
-            force,
-            json,
-        ).run()
+    options = Options(
+        camera, max_features, max_depth, tuple(topic or ()), frame, same_frame, poses, voxel,
+        keep_going,
+    )  # fmt: skip
+    replay = Replay(
+        recordings, out, config, loss, late or [], seed, options, unknown_frames, force, json
     )
+    raise typer.Exit(replay.run())
+
+
+@app.command()
+def inspect(
+    recording: Annotated[Path, typer.Argument(help="A recording of any kind that is read.")],
+    camera: Annotated[Path | None, typer.Option(help="camera.json to use.")] = None,
+    topic: _Topic = None,
+    frame: _Frame = None,
+    same_frame: _SameFrame = False,
+    poses: _Poses = None,
+    keep_going: _KeepGoing = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """List what a recording holds, and say what of it would be used."""
+    from ..io.sources import Options
+    from .inspect import show_source
+
+    options = Options(
+        camera, topics=tuple(topic or ()), frame=frame, same_frame=same_frame, poses=poses,
+        keep_going=keep_going,
+    )  # fmt: skip
+    raise typer.Exit(show_source(recording, options, json))
 
 
 @app.command()
@@ -165,6 +200,51 @@ def evaluate(
     from .evaluate import Evaluate
 
     Evaluate(map, reference, recall_reference, states, picture, json).run()
+
+
+@app.command()
+def export(
+    source: Annotated[
+        Path,
+        typer.Argument(help="A replay's folder, a ledger.db, an agent's TOML file, or a map.ply."),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(help="Its suffix names the format: ply pcd las laz e57 npz mcap yaml bt."),
+    ],
+    config: Annotated[
+        Path | None, typer.Option(help="TOML file under which the ledger was written.")
+    ] = None,
+    state: Annotated[
+        str, typer.Option(help="Which nodes: names with commas.")
+    ] = "confirmed,tentative",
+    robot: Annotated[
+        list[str] | None, typer.Option(help="Only what this robot saw; may be repeated.")
+    ] = None,
+    box: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(help="Lower corner, upper corner: x y z x y z, m.", metavar="X Y Z X Y Z"),
+    ] = None,
+    since: Annotated[float | None, typer.Option(help="Only what was seen from then on, s.")] = None,
+    until: Annotated[float | None, typer.Option(help="Only what was seen up to then, s.")] = None,
+    resolution: Annotated[float, typer.Option(help="m a cell, of yaml and bt.")] = 0.05,
+    height: Annotated[
+        tuple[float, float], typer.Option(help="The slice of a yaml grid, m along --up.")
+    ] = (0.1, 2.0),
+    up: Annotated[str, typer.Option(help="The axis that points up: z, -y, ...; for yaml.")] = "z",
+    free: Annotated[
+        bool, typer.Option(help="In yaml and bt: what rays passed through is free.")
+    ] = True,
+    force: Annotated[bool, typer.Option(help="Replace the file.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Write the map, or a part of it, in a format that other programs open."""
+    from ..io.writers import WriteOptions
+    from .export import Export
+
+    wanted = (tuple(robot or ()), box, since, until)
+    options = WriteOptions(resolution, height, up, free)
+    Export(source, out, config, state, wanted, options, force, json).run()
 
 
 @app.command()

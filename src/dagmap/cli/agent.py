@@ -84,7 +84,7 @@ class AgentCommand:
         if table is None:
             return None
         camera = None if table.camera is None else settings.at(table.camera)
-        return open_source(settings.at(table.path), camera=camera, max_features=table.max_features)
+        return open_source(settings.at(table.path), table.options(camera))
 
     def _assemble(
         self, settings: Settings, log: Log, stack: ExitStack

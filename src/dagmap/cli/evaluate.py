@@ -29,7 +29,7 @@ class Evaluate:
     json: bool
 
     def run(self) -> None:
-        chosen = _states(self.states)
+        chosen = states_named(self.states)
         cloud = read_cloud(self.map_file)
         which = "" if cloud.states is None else f" ({self.states} nodes)"
         points = check_cloud(_chosen(cloud, chosen), f"{self.map_file}{which}")
@@ -48,12 +48,13 @@ def _read(path: Path) -> Floats:
     return check_cloud(read_cloud(path).positions, str(path))
 
 
-def _states(names: str) -> list[State]:
+def states_named(names: str, option: str = "--states") -> list[State]:
+    """What `--states a,b` means. Raises DagmapError."""
     known = {state.name.lower(): state for state in State}
     chosen = [name.strip() for name in names.split(",")]
     wrong = [name for name in chosen if name not in known]
     if wrong:
-        raise DagmapError(f"--states: there is no {wrong[0]!r}; there are {', '.join(known)}")
+        raise DagmapError(f"{option}: there is no {wrong[0]!r}; there are {', '.join(known)}")
     return [known[name] for name in chosen]
 
 

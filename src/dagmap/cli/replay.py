@@ -30,7 +30,7 @@ from ..io.figures import (
     draw_traffic,
 )
 from ..io.report import write_report
-from ..io.sources import Source, open_source
+from ..io.sources import Options, Source, open_source
 from ..io.status import unplaced
 from ..io.store import Store
 from ..model import Accepted, Cycle, DagmapError, Floats, State
@@ -38,6 +38,7 @@ from ..sim.fleet import Fleet
 from ..sim.network import Link, Network
 from ..sim.robot import Happening, Robot
 from ..worldmap import WorldMap
+from .inspect import tell_skips
 from .kernels import warm_up
 
 _LIBRARIES = ("numpy", "numba", "msgspec", "cryptography", "opencv-python-headless", "matplotlib")
@@ -61,8 +62,7 @@ class Replay:
     loss: float
     late: list[str]
     seed: int
-    max_features: int
-    camera: Path | None
+    options: Options
     unknown_frames: bool
     force: bool
     json: bool
@@ -100,12 +100,14 @@ class Replay:
     def _open_sources(self) -> dict[str, Source]:
         sources: dict[str, Source] = {}
         for path in self.recordings:
-            source = open_source(path, max_features=self.max_features, camera=self.camera)
+            source = open_source(path, self.options)
             if source.name in sources:
                 raise DagmapError(
                     f"{path}: another recording is called {source.name} too; rename one of them"
                 )
             sources[source.name] = source
+            for note in getattr(source, "notes", ()):
+                self.console.print(f"{source.name}: {note}", soft_wrap=True, markup=False)
         return sources
 
     def _play(self, fleet: Fleet, sources: dict[str, Source]) -> None:
@@ -124,6 +126,8 @@ class Replay:
                 for step in fleet.run(tapped):
                     progress.update(task, advance=step.robot is not None)
                 progress.update(task, description="agreeing")
+        for source in sources.values():
+            tell_skips(source, self.console)
 
     def _tap(self, name: str, source: Source) -> Iterator[Cycle]:
         track = self._tracks[name] = _Track()

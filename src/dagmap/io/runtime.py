@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Literal, Protocol
 
 from ..agent import Agent
 from ..messages import Kind, kind_of
@@ -24,6 +24,7 @@ from ..model import (
     Forked,
     Issued,
     Outgoing,
+    Overloaded,
     Reason,
     Rejected,
     Revoked,
@@ -160,7 +161,7 @@ class Runtime:
 
     def _step(self) -> None:
         work = self.inbox.take(self._next_tick - time.monotonic())
-        begun = time.monotonic_ns()
+        begun, used = time.monotonic_ns(), time.thread_time()
         events = [event for cycle in work.cycles for event in self._observe(cycle)]
         for data in work.messages:
             events += self.agent.receive(data, self.now)
@@ -175,6 +176,7 @@ class Runtime:
         elif any(isinstance(event, Accepted) for event in events):
             soon = max(_SOON, self._tick_took)  # folding takes half of the time at most
             self._next_tick = min(self._next_tick, before + soon)
+        self.agent.took(time.thread_time() - used)
         self._keep(events)
         self._trace(begun, events)
         out = self.agent.outbox()
@@ -235,6 +237,8 @@ class Runtime:
                 self.counts.features += event.features
             elif isinstance(event, Rejected):
                 self._note_refusal(event)
+            elif isinstance(event, Overloaded):
+                self._note_overload(event)
             elif isinstance(event, Forked):
                 self._note_fork(event)
             elif isinstance(event, Revoked):
@@ -243,6 +247,17 @@ class Runtime:
             self._next_state = time.monotonic() + _STATE_PERIOD
             self._log.write("info", "state", **self._state())
             self._keep_state(self.agent)
+
+    def _note_overload(self, event: Overloaded) -> None:
+        level: Literal["warning", "info"] = "info" if event.features is None else "warning"
+        self._log.write(
+            level,
+            "overloaded" if level == "warning" else "no longer overloaded",
+            load=round(event.load, 3),
+            features_per_cycle="all" if event.features is None else event.features,
+            points_left_for_later=event.waiting,
+            points_dropped=event.dropped,
+        )
 
     def _note_fork(self, event: Forked) -> None:
         where = {"author": event.author.hex(), "sequence": event.sequence}

@@ -14,6 +14,7 @@ import msgspec
 
 from ..config import Config, _Checked, load_config
 from ..model import ConfigError
+from .sources import Options
 
 _MAX_FILE_NAME = 255  # bytes, of one part of a path
 
@@ -21,9 +22,28 @@ _MAX_FILE_NAME = 255  # bytes, of one part of a path
 class SourceConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The recording that stands in for a SLAM. Without this table the robot only listens."""
 
-    path: str  # a TUM RGB-D folder or a cycle stream .npz
+    path: str  # any recording that `dagmap inspect` knows
     max_features: int = 1000  # points that a frame of pictures gives at most
     camera: str | None = None  # a camera.json to use instead of the recording's own
+    max_depth: float | None = None  # m, points beyond are dropped
+    topics: tuple[str, ...] = ()  # of a bag; what is not named is found by its type
+    frame: str | None = None  # of a bag with tf: the frame that stands still
+    same_frame: bool = False  # poses are those of the sensor, whatever their frames are called
+    voxel: float = 0.1  # m: of a cloud one point a voxel is kept
+    keep_going: bool = False  # leave out what cannot be read
+
+    def options(self, camera: Path | None) -> Options:
+        """What the readers take. Raises ConfigError where one is out of its range."""
+        return Options(
+            camera=camera,
+            max_features=self.max_features,
+            max_depth=self.max_depth,
+            topics=self.topics,
+            frame=self.frame,
+            same_frame=self.same_frame,
+            voxel=self.voxel,
+            keep_going=self.keep_going,
+        )
 
 
 class TlsConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):

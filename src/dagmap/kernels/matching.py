@@ -340,7 +340,8 @@ def settled(
 ) -> None:
     """Whether what an author would say of each place adds nothing that counts.
 
-    It has said it `repeats` times, or once where as many authors as are wanted say it.
+    It has said it `repeats` times, or once where as many authors as are wanted say it. With 0
+    repeats: whether there is a node.
     """
     for i in range(xyz.shape[0]):
         x, y, z = int(xyz[i, 0]), int(xyz[i, 1]), int(xyz[i, 2])
@@ -353,7 +354,7 @@ def settled(
             if int(nodes.entries[entry, AUTHOR]) == author:
                 own = int(nodes.entries[entry, SEEN])
             entry = int(nodes.entries[entry, NEXT])
-        out[i] = own >= repeats or (own > 0 and authors >= witnesses)
+        out[i] = node >= 0 and (own >= repeats or (own > 0 and authors >= witnesses))
 
 
 @leaf

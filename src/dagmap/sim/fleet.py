@@ -24,6 +24,7 @@ from ..transaction import id_of
 from .network import Link, Network
 from .robot import (
     Clock,
+    Costs,
     Crashed,
     Happening,
     Liar,
@@ -86,6 +87,7 @@ class Fleet:
 
     on_event: told of everything that happens, before what follows from it is sent.
     check: called after every event with the robot that it concerned.
+    costs: what the robots' work is taken to cost; None: nothing.
     """
 
     def __init__(
@@ -96,7 +98,9 @@ class Fleet:
         check: Check | None = None,
         tick: float = TICK,
         parsers: Parsers | None = None,
+        costs: Costs | None = None,
     ) -> None:
+        self._costs = costs
         self._config, self._on_event, self._check = config, on_event, check
         self._network = network or Network(Link(), 0)
         self._tick, self._parsers = tick, parsers or SharedParsers().parsers
@@ -223,6 +227,8 @@ class Fleet:
 
     def _after(self, robot: Robot, events: list[Event]) -> None:
         """What a robot's runtime does after every step: store, sync, then send."""
+        if self._costs is not None:
+            robot.charge(self._costs)
         for event in events:
             if self._on_event is not None:
                 self._on_event(robot, event)

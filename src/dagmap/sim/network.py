@@ -83,7 +83,8 @@ class Network:
     ) -> None:
         if link.reach is not None and where is None:
             raise ConfigError("Link: a reach is given, but nobody says where the robots are")
-        self._link, self._partitions, self._where = link, tuple(partitions), where
+        self.link = link  # may be replaced at any time by a better or worse one
+        self._partitions, self._where = tuple(partitions), where
         self._random = random.Random(seed)
         self._free_at: dict[str, float] = {}  # when a robot's radio has sent what it holds
         self.dropped = 0  # messages that met a full queue
@@ -100,7 +101,7 @@ class Network:
             for receiver in receivers
             if not any(partition.cuts(sender, receiver, now) for partition in self._partitions)
         ]
-        reach, where = self._link.reach, self._where
+        reach, where = self.link.reach, self._where
         if reach is None or where is None:
             return hearing
         here = where(sender, now)
@@ -113,7 +114,7 @@ class Network:
         leaves = self._transmit(sender, size, now)
         if leaves is None:
             return []
-        link, chance = self._link, self._random
+        link, chance = self.link, self._random
         copies = []
         for receiver in self._hearing(sender, receivers, now):
             for _ in range(1 + (link.duplicate > 0 and chance.random() < link.duplicate)):
@@ -127,11 +128,11 @@ class Network:
 
     def _transmit(self, sender: str, size: int, now: float) -> float | None:
         """When the last byte has left the robot's radio; None where its queue is full."""
-        if self._link.bandwidth is None:
+        if self.link.bandwidth is None:
             return now
         start = max(now, self._free_at.get(sender, now))
-        if (start - now) * self._link.bandwidth > self._link.queue:
+        if (start - now) * self.link.bandwidth > self.link.queue:
             self.dropped += 1
             return None
-        self._free_at[sender] = start + size / self._link.bandwidth
+        self._free_at[sender] = start + size / self.link.bandwidth
         return self._free_at[sender]

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from ..agent import Agent, Parsers
+from ..equations import Work
 from ..model import AuthorId, ConfigError, Cycle, Event, Outgoing, TransactionId
 
 Moment: TypeAlias = Literal["between", "unsynced", "unsent"]
@@ -30,6 +31,18 @@ class Clock(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     def at(self, now: float) -> float:
         """What the robot reads."""
         return now * (1.0 + self.drift) + self.offset
+
+
+class Costs(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What work takes of a robot's processor, s a feature: simulated time has no other costs."""
+
+    inserted: float = 0.0
+    sent: float = 0.0
+    merged: float = 0.0
+
+    def of(self, work: Work) -> float:
+        """Seconds."""
+        return self.inserted * work.inserted + self.sent * work.sent + self.merged * work.merged
 
 
 class Disk:
@@ -154,6 +167,7 @@ class Robot:
     source: Source | None = None
     stream: Iterator[Timed] = field(default_factory=lambda: iter(()))
     plays: bool = False  # whether its SLAM goes on
+    charged: Work = field(default_factory=Work)  # what the agent was told the time of
     _ids: set[int] = field(default_factory=set)  # that this session has handed in
     _stamps: set[float] = field(default_factory=set)
 
@@ -171,10 +185,17 @@ class Robot:
         self.withdrawn.clear()  # what was not said before the crash never will be
         before = self.agent
         self.agent = Agent.restore(before.identity, before.config, self.disk.read(), parsers)
+        self.charged = replace(self.agent.steering.controller.work)
         self.session += 1
         self._ids, self._stamps = set(), set()
         if self.source is not None:
             self.stream = self.source.cycles(now, self.session)
+
+    def charge(self, costs: Costs) -> None:
+        """Tell the agent what its last step took."""
+        work = self.agent.steering.controller.work
+        self.agent.took(costs.of(work.since(self.charged)))
+        self.charged = replace(work)
 
     def perceived(self, cycle: Cycle) -> Cycle:
         """The cycle as this robot's clock stamps it, in the session that its SLAM is in.

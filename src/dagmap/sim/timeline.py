@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from ..model import Accepted, Forked, Issued, MapChanged, Rejected, Revoked, Waiting
+from ..model import Accepted, Forked, Issued, MapChanged, Overloaded, Rejected, Revoked, Waiting
 from .robot import Crashed, Happening, Observed, Received, Restarted, Robot
 
 
@@ -48,12 +48,21 @@ def _text(happening: Happening) -> str | None:
             return f"proves a fork of {author.hex()} at {sequence}"
         case Revoked(author, count):
             return f"counts {'all' if count is None else count} of {author.hex()} from now on"
+        case Overloaded() | Crashed() | Restarted():
+            return _fate(happening)
+        case MapChanged():
+            return None
+
+
+def _fate(happening: Overloaded | Crashed | Restarted) -> str:
+    match happening:
+        case Overloaded(load, features, waiting):
+            many = "all" if features is None else features
+            return f"inserts {many} a cycle at {load:.2f} of its time, {waiting} wait"
         case Crashed(moment):
             return f"crashes {moment}"
         case Restarted(transactions):
             return f"restarts with {transactions} transactions"
-        case MapChanged():
-            return None
 
 
 def _short(id_: bytes) -> str:

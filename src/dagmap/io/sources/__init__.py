@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Protocol, cast
 
 from ...model import RecordingError
+from ._source import Description as Description
 from ._source import Options as Options
 from ._source import Source as Source
 from .npz import save_cycles as save_cycles
 
-__all__ = ["Options", "Source", "open_source", "save_cycles"]
+__all__ = ["Description", "Options", "Source", "describe_source", "open_source", "save_cycles"]
 
 
 class _Reader(Protocol):
@@ -31,6 +32,7 @@ class _Reader(Protocol):
 
 def open_source(
     path: Path | str,
+    options: Options | None = None,
     *,
     camera: Path | None = None,
     max_features: int = 1000,
@@ -39,19 +41,34 @@ def open_source(
     """Open a recording with the first reader that knows its kind.
 
     camera: a camera.json to use instead of the recording's own.
-    max_features: points that a frame of pictures gives at most.
+    max_features: points that a frame gives at most.
     max_depth: metres beyond which a depth is not trusted; None: all are.
-    A reader takes the options that concern it. Raises RecordingError that names file, place and
-    remedy; what can only be seen in a single frame is raised while iterating.
+    options: these and more. A reader takes those that concern it. Raises RecordingError that names
+    file, place and remedy; what can only be seen in a single frame is raised while iterating.
     """
     path = Path(path)
-    options = Options(camera, max_features, max_depth)
+    options = options or Options(camera, max_features, max_depth)
+    return _reader_of(path).open(path, options)
+
+
+def describe_source(path: Path | str, options: Options | None = None) -> Description:
+    """What is in a recording, and what of it would be used. Raises RecordingError."""
+    path, options = Path(path), options or Options()
+    reader = _reader_of(path)
+    if hasattr(reader, "describe"):
+        return cast(Description, reader.describe(path, options))
+    source = reader.open(path, options)
+    notes = getattr(source, "notes", ())
+    return Description(reader.UNDERSTANDS, cycles=len(source), notes=notes)
+
+
+def _reader_of(path: Path) -> _Reader:
     if not path.exists():
         raise RecordingError(f"{path}: there is no such file or folder; check the path")
     readers = _readers()
     for reader in readers:
         if reader.matches(path):
-            return reader.open(path, options)
+            return reader
     known = " or ".join(reader.UNDERSTANDS for reader in readers)
     raise RecordingError(f"{path}: not a recording that DAGmap knows; it reads {known}")
 

@@ -68,14 +68,17 @@ class FrontEnd:
         cv2.setRNGSeed(0)
         self._orb = cv2.ORB_create(nfeatures=options.max_features)
 
-    def points(self, color: Path, depth: Path) -> tuple[Floats, Uint8s, Uint8s]:
+    def read(self, color: Path, depth: Path) -> tuple[Uint8s, Floats]:
+        """A picture (H, W, 3) BGR and its depths (H, W) m. Raises RecordingError that names it."""
+        return self._color(color), self._depth(depth)
+
+    def of(self, picture: Uint8s, metres: Floats) -> tuple[Floats, Uint8s, Uint8s]:
         """(N, 3) metres, (N, 3) RGB and (N, 32) ORB descriptors of at most `max_features` features
         with a valid depth, the strongest first.
 
-        Depth and colour are those of the pixel that the feature rounds to; a depth of 0 or beyond
-        `max_depth` is none. Raises RecordingError that names the picture.
+        Depth and colour are those of the pixel that the feature rounds to; a depth of 0 or NaN, or
+        beyond `max_depth`, is none.
         """
-        picture, metres = self._color(color), self._depth(depth)
         place, descriptors = self._detect(picture)
         pixel = np.floor(place + 0.5).astype(np.int64)
         pixel = np.clip(pixel, 0, (self._camera.width - 1, self._camera.height - 1))
@@ -116,7 +119,7 @@ class FrontEnd:
 
     def _decode(self, path: Path, flags: int) -> npt.NDArray[Any]:
         data = read_bytes(path)
-        if not _complete(data):
+        if not complete(data):
             raise RecordingError(
                 f"{path}: the picture is truncated or damaged; copy it anew, or drop its frame"
             )
@@ -139,7 +142,7 @@ class FrontEnd:
             )
 
 
-def _complete(data: bytes) -> bool:
+def complete(data: bytes) -> bool:
     """Whether PNG or JPEG bytes are all there: OpenCV returns what is left without a word."""
     if data.startswith(_PNG):
         return _complete_png(data)

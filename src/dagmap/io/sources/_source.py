@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
 from ...model import ConfigError, Cycle, CycleError, RecordingError, quantise_cycle
+
+_TOLD = 20  # things that were left out and are told of one by one
 
 
 class Source(Protocol):
@@ -30,12 +32,59 @@ class Options:
     camera: Path | None = None
     max_features: int = 1000
     max_depth: float | None = None  # m
+    topics: tuple[str, ...] = ()  # of a bag; what is not named is found by its type
+    frame: str | None = None  # of a bag with tf: the frame that stands still
+    same_frame: bool = False  # poses are those of the sensor, whatever their frames are called
+    poses: Path | None = None  # a file of poses beside clouds
+    voxel: float = 0.1  # m: of a cloud one point a voxel is kept
+    keep_going: bool = False  # leave out what cannot be read, and say so in `skipped`
 
     def __post_init__(self) -> None:
         if not 1 <= self.max_features <= 1 << 20:
             raise ConfigError(f"max_features = {self.max_features}, but 1 to 2^20 is wanted")
         if self.max_depth is not None and not self.max_depth > 0:
             raise ConfigError(f"max_depth = {self.max_depth}, but more than 0 m is wanted")
+        if not 0.001 <= self.voxel <= 1000:
+            raise ConfigError(f"voxel = {self.voxel}, but 0.001 to 1000 m is wanted")
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """A part of a recording: a topic, a folder, a table."""
+
+    name: str
+    kind: str
+    count: int
+    use: str = ""  # what it would be used for
+
+
+@dataclass(frozen=True, slots=True)
+class Description:
+    """What `dagmap inspect` tells. cycles: None where they are not known; problem: why not."""
+
+    kind: str
+    items: tuple[Item, ...] = ()
+    cycles: int | None = None
+    problem: str | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(slots=True)
+class Skips:
+    """What was left out of a recording, because `keep_going` says so."""
+
+    keep_going: bool
+    told: list[str] = field(default_factory=list)
+    count: int = 0
+
+    def note(self, error: RecordingError) -> None:
+        """Leave one thing out. Raises the error where that is not wanted."""
+        if not self.keep_going:
+            hint = "" if "--keep-going" in str(error) else "; --keep-going leaves it out"
+            raise RecordingError(f"{error}{hint}") from None
+        self.count += 1
+        if len(self.told) < _TOLD:
+            self.told.append(str(error))
 
 
 def folder_name(path: Path) -> str:

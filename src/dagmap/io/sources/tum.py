@@ -1,4 +1,7 @@
-"""A folder as the TUM RGB-D benchmark lays it out: pictures, depth, and the poses of a SLAM."""
+"""A folder as the TUM RGB-D benchmark lays it out: pictures, depth, and the poses of a SLAM.
+
+Without poses they are found by odometry; where that loses its way, a new session begins.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from ...model import Cycle, Floats, RecordingError
+from ._odometry import PictureOdometry
+from ._poses import SLACK, matrix, nearest
 from ._rgbd import FrontEnd, import_cv2, load_camera
-from ._source import Options, checked, folder_name, read_rows
+from ._source import Options, Skips, checked, folder_name, read_rows
 
-UNDERSTANDS = "a TUM RGB-D folder (rgb/, depth/, groundtruth.txt, camera.json)"
-_SLACK = 0.020 + 1e-9  # s: stamps no further apart are of one moment
+UNDERSTANDS = "a TUM RGB-D folder (rgb/, depth/, camera.json, groundtruth.txt)"
 _PARTS = ("rgb", "depth", "groundtruth.txt", "associations.txt", "rgb.txt", "depth.txt")
 
 
@@ -46,6 +50,8 @@ class TumFolder:
     def __init__(self, path: Path, options: Options) -> None:
         self.name = folder_name(path)
         self._path, self._options = path, options
+        self.skips = Skips(options.keep_going)
+        self.notes: tuple[str, ...] = ()
         for part in ("rgb", "depth"):
             if not (path / part).is_dir():
                 raise RecordingError(
@@ -61,24 +67,43 @@ class TumFolder:
         self._camera = load_camera(own if named is None else named)
         self._cv2 = import_cv2(path)
         frames = _frames(path)
-        placed = _placed(frames, path / "groundtruth.txt")
-        self.dropped = len(frames) - len(placed)
-        if not placed:
-            raise RecordingError(
-                f"{path}: none of {len(frames)} frames has a pose within 20 ms in "
-                "groundtruth.txt; check that both use the same clock"
-            )
-        self._placed = placed
+        self._placed = self._with_poses(frames, path / "groundtruth.txt")
+        self.dropped = len(frames) - len(self._placed)
 
     def __len__(self) -> int:
         return len(self._placed)
 
     def __iter__(self) -> Iterator[Cycle]:
         front = FrontEnd(self._cv2, self._camera, self._options)
+        self.skips = Skips(self._options.keep_going)
+        odometry = PictureOdometry(self._cv2, self._camera)
         for frame, pose in self._placed:
-            points, colors, described = front.points(frame.color, frame.depth)
-            cycle = Cycle(frame.stamp, pose, points, colors=colors, descriptors=described)
-            yield checked(cycle, self._path)
+            try:
+                picture, metres = front.read(frame.color, frame.depth)
+                pose = odometry.register(picture, metres) if pose is None else pose
+                points, colors, described = front.of(picture, metres)
+                session = max(odometry.session, 0)
+                cycle = Cycle(
+                    frame.stamp, pose, points, colors=colors, session=session, descriptors=described
+                )
+                cycle = checked(cycle, self._path)
+            except RecordingError as error:
+                self.skips.note(error)
+                continue
+            yield cycle
+
+    def _with_poses(self, frames: list[_Frame], file: Path) -> list[tuple[_Frame, Floats | None]]:
+        """The frames that have a pose; without a file of poses all, to be found by odometry."""
+        if not file.exists():
+            self.notes = ("no groundtruth.txt: odometry by OpenCV",)
+            return [(frame, None) for frame in frames]
+        placed = _placed(frames, file)
+        if not placed:
+            raise RecordingError(
+                f"{self._path}: none of {len(frames)} frames has a pose within 20 ms in "
+                "groundtruth.txt; check that both use the same clock"
+            )
+        return placed
 
 
 def _frames(path: Path) -> list[_Frame]:
@@ -125,9 +150,9 @@ def _matched(path: Path) -> list[_Frame]:
     color_stamps = np.array([stamp for stamp, _ in colors])
     depth_stamps = np.array([stamp for stamp, _ in depths])
     frames = []
-    for (stamp, depth), i in zip(depths, _nearest(color_stamps, depth_stamps), strict=True):
-        back = _nearest(depth_stamps, color_stamps[i : i + 1])[0]
-        if abs(colors[i][0] - stamp) <= _SLACK and depths[back][1] == depth:
+    for (stamp, depth), i in zip(depths, nearest(color_stamps, depth_stamps), strict=True):
+        back = nearest(depth_stamps, color_stamps[i : i + 1])[0]
+        if abs(colors[i][0] - stamp) <= SLACK and depths[back][1] == depth:
             frames.append(_Frame(stamp, colors[i][1], depth))
     return frames
 
@@ -155,14 +180,14 @@ def _list(path: Path, part: str) -> list[tuple[float, Path]]:
     return pictures
 
 
-def _placed(frames: list[_Frame], file: Path) -> list[tuple[_Frame, Floats]]:
+def _placed(frames: list[_Frame], file: Path) -> list[tuple[_Frame, Floats | None]]:
     """The frames with the pose nearest to their depth, where one lies within 20 ms."""
     stamps, poses = _trajectory(file)
-    nearest = _nearest(stamps, np.array([frame.stamp for frame in frames]))
+    closest = nearest(stamps, np.array([frame.stamp for frame in frames]))
     return [
         (frame, poses[i])
-        for frame, i in zip(frames, nearest, strict=True)
-        if abs(stamps[i] - frame.stamp) <= _SLACK
+        for frame, i in zip(frames, closest, strict=True)
+        if abs(stamps[i] - frame.stamp) <= SLACK
     ]
 
 
@@ -185,18 +210,11 @@ def _trajectory(file: Path) -> tuple[Floats, Floats]:
 def _pose(values: list[float], line: str) -> Floats:
     """(4, 4) from translation and quaternion."""
     quaternion = np.array(values[3:])
-    with np.errstate(over="ignore"):  # to infinity, which is refused
-        length = float(np.linalg.norm(quaternion))
-    if not 0.9 < length < 1.1:
+    pose = matrix(np.array(values[:3]), quaternion)
+    if pose is None:
+        with np.errstate(over="ignore"):  # to infinity, which is refused
+            length = float(np.linalg.norm(quaternion))
         raise RecordingError(f"{line}: a quaternion of length {length:.3g}; 1 is wanted")
-    x, y, z, w = quaternion / length
-    pose = np.eye(4)
-    pose[:3, 3] = values[:3]
-    pose[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
     return pose
 
 
@@ -217,11 +235,3 @@ def _require_rising(stamps: list[tuple[float, str]]) -> None:
                 f"{line}: the stamp {stamp} does not come after {before}; stamps must rise, sort "
                 "the lines and drop doubles"
             )
-
-
-def _nearest(rising: Floats, stamps: Floats) -> list[int]:
-    """Index of the nearest of some rising stamps, the earlier one of two as near."""
-    right = np.minimum(np.searchsorted(rising, stamps), len(rising) - 1)
-    left = np.maximum(right - 1, 0)
-    later = np.abs(rising[right] - stamps) < np.abs(rising[left] - stamps)
-    return [int(i) for i in np.where(later, right, left)]

@@ -1,0 +1,132 @@
+"""The paper's Figure 11: features a second on the wire, with and without DAGmap.
+
+The office with a SLAM that hands its points over every 4.8 s (eight cycles of the recording at
+once), and a simulated mission of robots whose SLAM has a cycle of 5 s. Each with the usual
+configuration but for `cycle_period`, so that the first cycle is spread as well. Writes
+out/traffic/NAME.png where matplotlib is installed.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from dagmap import Config, Cycle, GraphConfig
+from dagmap.config import IssuanceConfig
+from dagmap.io.figures import RobotTraffic, TrafficFigure, draw_traffic
+from dagmap.io.sources import open_source
+from dagmap.model import OutputError
+from dagmap.sim.fleet import Fleet
+from dagmap.sim.mission import Mission
+from dagmap.sim.robot import Robot
+from dagmap.sim.scenario import Scenario
+from dagmap.sim.sensor import SensorConfig
+
+Row = dict[str, Any]
+BY_NAME_ONLY = True  # the simulated hour takes minutes
+OFFICE = Path(__file__).parents[1] / "examples" / "office"
+OUT = Path("out/traffic")
+TOGETHER = 8
+
+
+def joined(cycles: Iterable[Cycle]) -> Iterator[Cycle]:
+    """Cycles of a SLAM that hands over what it has seen only now and then."""
+    held: list[Cycle] = []
+    for cycle in cycles:
+        held.append(cycle)
+        if len(held) == TOGETHER:
+            yield _one(held)
+            held = []
+    if held:
+        yield _one(held)
+
+
+def _one(cycles: list[Cycle]) -> Cycle:
+    last = cycles[-1]
+    back = np.linalg.inv(np.asarray(last.pose, np.float64))
+    points = []
+    for cycle in cycles:
+        pose = back @ np.asarray(cycle.pose, np.float64)
+        points.append(np.asarray(cycle.points, np.float64) @ pose[:3, :3].T + pose[:3, 3])
+    return Cycle(last.stamp, last.pose, np.concatenate(points))
+
+
+def office() -> list[Robot]:
+    issuance = IssuanceConfig(cycle_period=0.6 * TOGETHER)
+    fleet = Fleet(msgspec.structs.replace(Config(), issuance=issuance))
+    recordings = {f"robot{i}": joined(open_source(OFFICE / f"robot{i}")) for i in (1, 2, 3)}
+    for _ in fleet.run(recordings):
+        pass
+    return list(fleet.robots.values())
+
+
+def hour(seconds: float) -> list[Robot]:
+    config = Config(
+        graph=GraphConfig(reference_pitch=0.25, max_parent_distance=0.75),
+        issuance=IssuanceConfig(cycle_period=5.0),
+    )
+    sensor = SensorConfig(points=400, period=5.0)
+    scenario = Scenario(
+        name="an hour", robots=3, seconds=seconds, tick=0.25, config=config, sensor=sensor
+    )
+    mission = Mission(scenario, 1)
+    mission.play()
+    return list(mission.fleet.robots.values())
+
+
+def measure(name: str, robots: list[Robot]) -> list[Row]:
+    """Peaks and means over seconds from the first cycle to the last."""
+    draw_all(name, robots)
+    return [_row(name, [robot]) for robot in robots] + [_row(name, robots)]
+
+
+def _row(name: str, robots: list[Robot]) -> Row:
+    seen = [pair for robot in robots for pair in robot.observed_at]
+    sent = [pair for robot in robots for pair in robot.issued_at]
+    span = int(max(at for at, _ in [*seen, *sent])) + 1
+    without, with_it = (_bins(pairs, span) for pairs in (seen, sent))
+    ratios = without.max() / without.mean(), with_it.max() / with_it.mean()
+    return {
+        "name": name,
+        "robots": ", ".join(robot.name for robot in robots),
+        "features_without": int(without.sum()),
+        "features_with": int(with_it.sum()),
+        "peak_without": int(without.max()),
+        "peak_with": int(with_it.max()),
+        "peak_to_mean_without": ratios[0],
+        "peak_to_mean_with": ratios[1],
+        "part": ratios[1] / ratios[0],
+        "bytes": sum(robot.bytes_sent for robot in robots),
+    }
+
+
+def _bins(pairs: list[tuple[float, int]], span: int) -> np.ndarray:
+    at = np.array([int(t) for t, _ in pairs])
+    return np.bincount(at, [count for _, count in pairs], span)
+
+
+def draw_all(name: str, robots: list[Robot]) -> None:
+    OUT.mkdir(parents=True, exist_ok=True)
+    found = [
+        RobotTraffic(robot.name, *_columns(robot.issued_at), *_columns(robot.observed_at))
+        for robot in robots
+    ]
+    try:
+        draw_traffic(OUT / f"{name}.png", TrafficFigure(found))
+    except (ImportError, OutputError):
+        return
+
+
+def _columns(pairs: list[tuple[float, int]]) -> tuple[Any, Any]:
+    return np.array([at for at, _ in pairs]), np.array([count for _, count in pairs], np.int64)
+
+
+def run(seconds: float | None = None) -> list[Row]:
+    """Rows. The mission lasts an hour, or DAGMAP_BENCH_SECONDS."""
+    seconds = seconds or float(os.environ.get("DAGMAP_BENCH_SECONDS", "3600"))
+    return measure("office", office()) + measure("hour", hour(seconds))

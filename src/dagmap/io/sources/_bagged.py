@@ -1,0 +1,296 @@
+"""The cycles of a bag: clouds, or pictures with depth, each with the pose of its moment."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...model import Cycle, Floats, RecordingError
+from . import _ros as ros
+from ._bag import Bag, Message
+from ._cloud import thinned
+from ._kiss import KissIcp
+from ._odometry import PictureOdometry
+from ._poses import SLACK, FrameTree, Trajectory, nearest
+from ._rgbd import Camera, FrontEnd, import_cv2, load_camera
+from ._source import Options, Skips, checked
+
+_FIXED = ("map", "odom", "world", "earth")  # what stands still is called so, by REP 105
+_STORED = 200  # pictures that wait for their partner at most
+
+
+class BagPoses:
+    """Where a sensor was: odometry (or another pose), with tf between its frame and the sensor's;
+    or tf alone.
+    """
+
+    def __init__(self, bag: Bag, topic: str, tf: tuple[str, ...], options: Options) -> None:
+        self._bag, self._options, self.topic = bag, options, topic
+        self._trajectory, self._tree, self._child = Trajectory(), FrameTree(), ""
+        for message in bag.messages({topic, *tf} - {""}):
+            try:
+                if message.topic == topic:
+                    self._take_pose(message)
+                else:
+                    self._take_frames(message)
+            except RecordingError as error:
+                bag.skips.note(error)
+
+    @property
+    def known(self) -> bool:
+        return bool(len(self._trajectory)) or bool(len(self._tree) and not self.topic)
+
+    def check(self, frame: str) -> str:
+        """What the poses are, in words. Raises RecordingError where they do not fit a frame."""
+        if self.topic:
+            if self._same(frame):
+                return f"poses of {self.topic}"
+            if self._tree.connects(self._child, frame):
+                return f"poses of {self.topic}, tf from {self._child} to {frame}"
+            raise RecordingError(
+                f"{self._bag.path}: {self.topic} tells where {self._child!r} is, and no tf leads "
+                f"from there to {frame!r}, the sensor's frame; record /tf_static too, or say "
+                "--same-frame if the poses are the sensor's"
+            )
+        return f"poses by tf: {frame} in {self._fixed(frame)}"
+
+    def at(self, stamp: float, frame: str) -> Floats | None:
+        """(4, 4) of the sensor at a moment; None where it is not known."""
+        if not self.topic:
+            return self._tree.pose(self._fixed(frame), frame, stamp)
+        pose = self._trajectory.at(stamp)
+        if pose is None or self._same(frame):
+            return pose
+        mounted = self._tree.pose(self._child, frame, stamp)
+        return None if mounted is None else pose @ mounted
+
+    def _same(self, frame: str) -> bool:
+        return self._options.same_frame or self._child in ("", frame)
+
+    def _fixed(self, frame: str) -> str:
+        above = self._tree.above(frame)
+        named = self._options.frame
+        if named is not None:
+            if named.lstrip("/") not in above:
+                raise RecordingError(
+                    f"{self._bag.path}: no tf leads from {named!r} to {frame!r}; above it are "
+                    f"{', '.join(above)}"
+                )
+            return named.lstrip("/")
+        if len(above) == 1:
+            raise RecordingError(
+                f"{self._bag.path}: no tf leads to {frame!r}, the sensor's frame; record /tf and "
+                "/tf_static too, or name a topic with poses by --topic"
+            )
+        return next((name for name in _FIXED if name in above), above[-1])
+
+    def _take_pose(self, message: Message) -> None:
+        self._child, stamp, pose = self._bag.read(message, ros.pose_of)
+        self._trajectory.add(stamp, pose)
+
+    def _take_frames(self, message: Message) -> None:
+        still = "static" in message.topic
+        for parent, child, stamp, pose in self._bag.read(message, ros.transforms):
+            self._tree.add(parent, child, None if still else stamp, pose)
+
+
+class _Stamps:
+    """The messages of a topic that rise in time: number in the topic, stamp, frame."""
+
+    def __init__(self, bag: Bag, topic: str, skips: Skips) -> None:
+        self.rows: list[tuple[int, float, str]] = []
+        for number, message in enumerate(bag.messages({topic})):
+            try:
+                stamp, frame = ros.peek(message.raw, bag.ros2)
+                stamp = stamp or message.stamp  # some drivers leave the header empty
+                if self.rows and stamp <= self.rows[-1][1]:
+                    raise ros.Unusable(
+                        f"its stamp {stamp:.6f} does not come after {self.rows[-1][1]:.6f}"
+                    )
+            except ros.Unusable as fault:
+                skips.note(bag.wrong(message, fault))
+                continue
+            self.rows.append((number, stamp, frame))
+        if not self.rows:
+            raise RecordingError(f"{bag.path}: {topic} holds no message that can be used")
+
+    @property
+    def stamps(self) -> Floats:
+        return np.array([stamp for _, stamp, _ in self.rows])
+
+
+class CloudBag:
+    """Clouds as cycles. dropped: clouds without a pose. notes: what was chosen."""
+
+    def __init__(
+        self, bag: Bag, topic: str, poses: BagPoses, options: Options, skips: Skips
+    ) -> None:
+        self.name, self.skips = _name(bag.path), skips
+        self._bag, self._topic, self._options = bag, topic, options
+        rows = _Stamps(bag, topic, skips).rows
+        self._poses: dict[int, Floats] | None = None
+        if poses.known:
+            self.notes: tuple[str, ...] = (poses.check(rows[0][2]),)
+            self._poses = _placed(poses, rows)
+            _require(bag.path, topic, len(rows), len(self._poses), poses.topic)
+        else:
+            KissIcp.require(bag.path)
+            self.notes = ("no poses in it: odometry by KISS-ICP",)
+        self._stamps = {number: stamp for number, stamp, _ in rows}
+        self.dropped = 0 if self._poses is None else len(rows) - len(self._poses)
+
+    def __len__(self) -> int:
+        return len(self._stamps) if self._poses is None else len(self._poses)
+
+    def __iter__(self) -> Iterator[Cycle]:
+        odometry = None if self._poses is not None else KissIcp(self._options)
+        for number, message in enumerate(self._bag.messages({self._topic})):
+            if number not in (self._stamps if self._poses is None else self._poses):
+                continue
+            try:
+                points, colors = self._bag.read(message, ros.cloud_arrays)
+                pose = odometry.register(points) if odometry else (self._poses or {})[number]
+                points, colors = thinned(points, colors, self._options)
+                cycle = Cycle(self._stamps[number], pose, points, colors=colors)
+                yield checked(cycle, self._bag.path)
+            except RecordingError as error:
+                self.skips.note(error)
+
+
+class RgbdBag:
+    """Pictures with depth as cycles, in the order of the depths' stamps."""
+
+    def __init__(
+        self,
+        bag: Bag,
+        depth: str,
+        color: str,
+        camera: str,
+        poses: BagPoses,
+        options: Options,
+        skips: Skips,
+    ) -> None:
+        self.name, self.skips = _name(bag.path), skips
+        self._bag, self._depth, self._color, self._options = bag, depth, color, options
+        self._cv2 = import_cv2(bag.path)
+        self._camera = _camera(bag, camera, options)
+        depths, colors = _Stamps(bag, depth, skips), _Stamps(bag, color, skips)
+        self.notes: tuple[str, ...] = ("no poses in it: odometry by OpenCV",)
+        placed: dict[int, Floats] | None = None
+        if poses.known:
+            self.notes = (poses.check(depths.rows[0][2]),)
+            placed = _placed(poses, depths.rows)
+            _require(bag.path, depth, len(depths.rows), len(placed), poses.topic)
+        partner = nearest(colors.stamps, depths.stamps)
+        self._pairs: list[tuple[int, int, float, Floats | None]] = []
+        for (number, stamp, _), i in zip(depths.rows, partner, strict=True):
+            pose = None if placed is None else placed.get(number)
+            if abs(colors.rows[i][1] - stamp) <= SLACK and (placed is None or pose is not None):
+                self._pairs.append((number, colors.rows[i][0], stamp, pose))
+        self.dropped = len(depths.rows) - len(self._pairs)
+        if not self._pairs:
+            raise RecordingError(
+                f"{bag.path}: no picture of {color} lies within 20 ms of one of {depth}; check "
+                "that both use the same clock, or name others with --topic"
+            )
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def __iter__(self) -> Iterator[Cycle]:
+        front = FrontEnd(self._cv2, self._camera, self._options)
+        odometry = PictureOdometry(self._cv2, self._camera)
+        for stamp, pose, depth, color in self._matched():
+            try:
+                metres = self._bag.read(depth, partial(ros.depth_picture, self._cv2, depth.kind))
+                picture = self._bag.read(color, partial(ros.color_picture, self._cv2, color.kind))
+                self._check_sizes(depth, metres, picture)
+                pose = odometry.register(picture, metres) if pose is None else pose
+                points, colors, described = front.of(picture, metres)
+                session = max(odometry.session, 0)
+                cycle = Cycle(
+                    stamp, pose, points, colors=colors, session=session, descriptors=described
+                )
+                cycle = checked(cycle, self._bag.path)
+            except RecordingError as error:
+                self.skips.note(error)
+                continue
+            yield cycle
+
+    def _matched(self) -> Iterator[tuple[float, Floats | None, Message, Message]]:
+        """Pairs as soon as both are there, in order; few messages are in memory at a time."""
+        depths: dict[int, Message] = {}
+        colors: dict[int, Message] = {}
+        wanted = ({d for d, _, _, _ in self._pairs}, {c for _, c, _, _ in self._pairs})
+        counts, at = [0, 0], 0
+        for message in self._bag.messages({self._depth, self._color}):
+            side = 0 if message.topic == self._depth else 1
+            number, counts[side] = counts[side], counts[side] + 1
+            if number in wanted[side]:
+                (depths, colors)[side][number] = message
+            while at < len(self._pairs):
+                depth, color, stamp, pose = self._pairs[at]
+                if depth not in depths or color not in colors:
+                    break
+                yield stamp, pose, depths.pop(depth), colors[color]
+                at += 1
+                for old in [c for c in colors if c < color]:
+                    del colors[old]
+            if len(depths) + len(colors) > _STORED:
+                raise RecordingError(
+                    f"{self._bag.path}: {self._depth} and {self._color} lie more than "
+                    f"{_STORED // 2} pictures apart in the file; sort it with `ros2 bag convert`"
+                )
+
+    def _check_sizes(self, depth: Message, metres: Floats, picture: Any) -> None:
+        wanted = (self._camera.height, self._camera.width)
+        if metres.shape != wanted or picture.shape[:2] != wanted:
+            raise self._bag.wrong(
+                depth,
+                f"depth {metres.shape[::-1]}, colour {picture.shape[1::-1]}, camera "
+                f"{wanted[::-1]}: one size is wanted; record the depth that is registered to the "
+                "colour (aligned_depth_to_color, depth_registered)",
+            )
+
+
+def _camera(bag: Bag, topic: str, options: Options) -> Camera:
+    if options.camera is not None:
+        return load_camera(options.camera)
+    for message in bag.messages({topic}):
+        return bag.read(message, _pinhole)
+    raise RecordingError(f"{bag.path}: {topic} holds no message; name a camera.json with --camera")
+
+
+def _placed(poses: BagPoses, rows: list[tuple[int, float, str]]) -> dict[int, Floats]:
+    """Poses by the number of the message, where there is one for its moment."""
+    found = ((number, poses.at(stamp, frame)) for number, stamp, frame in rows)
+    return {number: pose for number, pose in found if pose is not None}
+
+
+def _require(path: Path, topic: str, count: int, placed: int, poses: str) -> None:
+    if not placed:
+        raise RecordingError(
+            f"{path}: none of {count} messages of {topic} has a pose of {poses or 'tf'} for its "
+            "moment; check that both use the same clock (use_sim_time)"
+        )
+
+
+def _name(path: Path) -> str:
+    return path.stem if path.is_file() else Path(path).resolve().name
+
+
+def _pinhole(info: Any) -> Camera:
+    """Of a CameraInfo, whose K is large in ROS 1. Raises Unusable."""
+    k = np.asarray(info.k if hasattr(info, "k") else info.K, np.float64).reshape(-1)
+    width, height = int(info.width), int(info.height)
+    if len(k) != 9 or not np.isfinite(k).all() or not (k[[0, 4]] > 0).all() or not width * height:
+        raise ros.Unusable(
+            f"the camera is not calibrated (K = {k.tolist()}); calibrate it, or name a camera.json "
+            "with --camera"
+        )
+    fx, fy, cx, cy = k[[0, 4, 2, 5]].tolist()
+    return Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, depth_scale=1000.0)

@@ -1,0 +1,143 @@
+"""Poses over time: trajectories, and the tree of frames that tf tells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from ...model import Floats
+
+SLACK = 0.020 + 1e-9  # s: stamps no further apart are of one moment
+_GAP = 1.0  # s: over longer ones nothing is interpolated
+_MOST_FRAMES = 100  # between a sensor and the fixed frame
+
+
+def matrix(translation: Floats, quaternion: Floats) -> Floats | None:
+    """(4, 4) from (3,) m and (4,) x y z w; None where they are no pose."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        length = float(np.linalg.norm(quaternion))
+    if not 0.9 < length < 1.1 or not np.isfinite(translation).all():
+        return None
+    x, y, z, w = quaternion / length
+    pose = np.eye(4)
+    pose[:3, 3] = translation
+    pose[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return pose
+
+
+def inverse(pose: Floats) -> Floats:
+    """Of a rigid (4, 4)."""
+    out = np.eye(4)
+    out[:3, :3] = pose[:3, :3].T
+    out[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return out
+
+
+def between(a: Floats, b: Floats, share: float) -> Floats:
+    """The pose at a share of the way from a to b: straight, turning at one rate."""
+    turn = a[:3, :3].T @ b[:3, :3]
+    angle = float(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
+    out = a.copy()
+    out[:3, 3] = (1 - share) * a[:3, 3] + share * b[:3, 3]
+    if angle > np.pi - 1e-3:  # the axis cannot be told: the nearer one of the two
+        out[:3, :3] = a[:3, :3] if share < 0.5 else b[:3, :3]
+    elif angle > 1e-9:
+        axis = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+        x, y, z = axis / (2 * np.sin(angle))
+        k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        part = share * angle
+        out[:3, :3] = a[:3, :3] @ (np.eye(3) + np.sin(part) * k + (1 - np.cos(part)) * k @ k)
+    return out
+
+
+@dataclass(slots=True)
+class Trajectory:
+    """Poses by stamp. They may be added in any order; of two with one stamp the later counts."""
+
+    _rows: dict[float, Floats] = field(default_factory=dict)
+    _stamps: Floats | None = None
+
+    def add(self, stamp: float, pose: Floats) -> None:
+        self._rows[stamp] = pose
+        self._stamps = None
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def at(self, stamp: float) -> Floats | None:
+        """(4, 4) interpolated; the nearest one within 20 ms where there is no pair; else None."""
+        if not self._rows:
+            return None
+        if self._stamps is None:
+            self._stamps = np.array(sorted(self._rows))
+        i = int(np.searchsorted(self._stamps, stamp))
+        around = self._stamps[max(i - 1, 0) : i + 1].tolist()
+        if len(around) == 2 and around[0] < stamp <= around[1] and around[1] - around[0] <= _GAP:
+            a, b = around
+            return between(self._rows[a], self._rows[b], (stamp - a) / (b - a))
+        nearest = min(around, key=lambda s: abs(s - stamp))
+        return self._rows[nearest] if abs(nearest - stamp) <= SLACK else None
+
+
+@dataclass(slots=True)
+class FrameTree:
+    """tf: every frame has one parent, and a pose in it that may change with time."""
+
+    _parents: dict[str, str] = field(default_factory=dict)
+    _moving: dict[str, Trajectory] = field(default_factory=dict)
+    _still: dict[str, Floats] = field(default_factory=dict)
+
+    def add(self, parent: str, child: str, stamp: float | None, pose: Floats) -> None:
+        """stamp: None for what never moves."""
+        self._parents[child] = parent
+        if stamp is None:
+            self._still[child] = pose
+        else:
+            self._moving.setdefault(child, Trajectory()).add(stamp, pose)
+
+    def __len__(self) -> int:
+        return len(self._parents)
+
+    def above(self, frame: str) -> list[str]:
+        """The frame, its parent, and so on up to the root."""
+        chain = [frame]
+        while chain[-1] in self._parents and len(chain) < _MOST_FRAMES:
+            chain.append(self._parents[chain[-1]])
+        return chain
+
+    def connects(self, target: str, frame: str) -> bool:
+        return bool(set(self.above(target)) & set(self.above(frame)))
+
+    def pose(self, target: str, frame: str, stamp: float) -> Floats | None:
+        """(4, 4) of `frame` in `target`; None where the tree does not tell, or not for then."""
+        common = next((f for f in self.above(target) if f in self.above(frame)), None)
+        if common is None:
+            return None
+        down, up = self._up_to(common, frame, stamp), self._up_to(common, target, stamp)
+        return None if down is None or up is None else inverse(up) @ down
+
+    def _up_to(self, ancestor: str, frame: str, stamp: float) -> Floats | None:
+        pose = np.eye(4)
+        chain = self.above(frame)
+        for child, _ in pairwise(chain[: chain.index(ancestor) + 1]):
+            step = self._still.get(child)
+            if step is None:
+                step = self._moving[child].at(stamp)
+            if step is None:
+                return None
+            pose = step @ pose
+        return pose
+
+
+def nearest(rising: Floats, stamps: Floats) -> list[int]:
+    """Index of the nearest of some rising stamps, the earlier one of two as near."""
+    right = np.minimum(np.searchsorted(rising, stamps), len(rising) - 1)
+    left = np.maximum(right - 1, 0)
+    later = np.abs(rising[right] - stamps) < np.abs(rising[left] - stamps)
+    return [int(i) for i in np.where(later, right, left)]
