@@ -159,6 +159,28 @@ class TestWork:
 
 
 class TestLateOnes:
+    def test_one_that_is_cut_and_counts_again_within_a_revision_is_folded_once(self) -> None:
+        """A revocation that the fork of the fleet key takes back, while a revision goes on."""
+        author, other, late, consensus = Author("a"), Author("b"), Author("c"), Consensus(CONFIG)
+        for i in range(30):
+            consensus.add(author.make(lamport=100 + i))
+        consensus.advance()
+        consensus.add(late.make(lamport=1))
+        consensus.advance(600)
+        assert consensus.revising and consensus._upwards
+        for i in range(4):
+            consensus.add(other.make(lamport=50 + i))
+        consensus.cut(other.identity.author, 1)
+        for tx in other.chain[1:]:
+            assert tx not in consensus
+            tx.payload = tx.decode_again(CONFIG)
+            consensus.add(tx)
+        scratch, digest = Consensus(CONFIG), consensus.digest()
+        for tx in [*author.chain, *other.chain, *late.chain]:
+            tx.payload = tx.decode_again(CONFIG)
+            scratch.add(tx)
+        assert digest == scratch.digest()
+
     def test_one_with_every_call_does_not_keep_a_revision_from_its_end(self) -> None:
         author, late, consensus = Author("a"), Author("b"), Consensus(CONFIG)
         for i in range(30):

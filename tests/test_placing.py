@@ -11,12 +11,24 @@ import msgspec
 import numpy as np
 import pytest
 
+from chains import Author as ChainAuthor
+from chains import anchor
 from dagmap import Agent, Config, Cycle
 from dagmap.config import PlacingConfig, load_config
+from dagmap.consensus import Consensus
 from dagmap.frames import contradicted, place_frames
+from dagmap.ledger import Ledger
 from dagmap.messages import Transactions, encode
-from dagmap.model import FLEET_FRAME, Accepted, FrameId, pose_matrix, quantise_pose
-from dagmap.payload import Described, Link
+from dagmap.model import (
+    FLEET_FRAME,
+    MAX_KEYFRAMES,
+    Accepted,
+    FrameId,
+    pose_matrix,
+    quantise_pose,
+)
+from dagmap.payload import Described, Link, Payload
+from dagmap.placing import Placing
 from dagmap.sim.fleet import Fleet
 from dagmap.sim.robot import Robot
 from scene import QUICK, agent, pose
@@ -304,6 +316,132 @@ def test_an_agent_that_starts_again_goes_on(three: dict[str, Agent]) -> None:
     assert again.digest() == ann.digest() and again.unplaced == {}
 
 
+def test_a_link_follows_a_loop_closure() -> None:
+    """Nothing new is seen; all that bob has seen moves."""
+    places, described = room(1), names(1)
+    seen, shift = walk(places, described, STARTS["bob"], 1), pose(5.0, 3.0, 0.0, 1.0)
+    poses = np.stack([shift @ np.asarray(cycle.pose) for cycle in seen])
+    stamps = [cycle.stamp for cycle in seen]
+    closure = Cycle(20.0, poses[-1], np.zeros((0, 3)), moved=(stamps, poses))
+    agents = meet(ann=walk(places, described), bob=[*seen, closure])
+    metres, degrees = off(relative(agents, "ann", "bob"), STARTS["ann"], shift @ STARTS["bob"])
+    assert metres < 0.03 and degrees < 0.3
+
+
+def silent(start: Points = STARTS["bob"]) -> dict[str, Agent]:
+    """Ann and bob have shown each other their described points, and published no link."""
+    never = msgspec.structs.replace(UNKNOWN.placing, inliers=1 << 20)
+    mute = msgspec.structs.replace(UNKNOWN, placing=never)
+    places, described = room(1), names(1)
+    return meet(mute, ann=walk(places, described), bob=walk(places, described, start, 1))
+
+
+def issues(robot: Agent, calls: int) -> bool:
+    return any(type(e).__name__ == "Issued" for at in range(calls) for e in robot.tick(float(at)))
+
+
+def test_a_robot_that_listens_for_its_own_chain_signs_no_link() -> None:
+    """It may have been told already, with a number that the copy of the ledger does not know."""
+    ann = silent()["ann"]
+    again = Agent.restore(ann.identity, UNKNOWN, [tx.data for tx in ann.ledger])
+    again.listening = True
+    assert not issues(again, 20)
+    again.listening = False
+    again.resume()
+    assert issues(again, 20)
+
+
+def test_described_points_beyond_all_reach_are_no_reason_to_stop() -> None:
+    """Who repeats a robot's described points a thousand kilometres away offers it a frame that no
+    pose can tell of."""
+    ann, bob = agent("ann", UNKNOWN), agent("bob", UNKNOWN)
+    far, further = np.eye(4), np.array([3e8, 3e8, 4e8])
+    far[:3, 3] = 500_000.0
+    for cycle in walk(room(1), names(1)):
+        ann.observe(cycle, cycle.stamp)
+        bob.observe(replace(cycle, pose=far @ np.asarray(cycle.pose)), cycle.stamp)
+    held = bob.observing._keyframes._held
+    for at, (keyframe, cycle) in enumerate(zip(held, walk(room(1), names(1)), strict=True)):
+        offset = (further @ np.asarray(cycle.pose)[:3, :3]).astype(np.int32)
+        held[at] = replace(keyframe, position=keyframe.position + offset)
+    bob.observing.relate([], True)
+    bob.tick(10.0)
+    for out in bob.outbox():
+        ann.receive(out.data, 10.0)
+    for at in range(20):
+        ann.tick(11.0 + at)
+    assert ann.unplaced[FrameId(bob.identity.author)] == "it lies beyond 2^29 mm"
+
+
+def test_a_link_that_is_a_thousandth_off_a_rotation_is_an_answer_like_others() -> None:
+    """The quaternion of a foreign pose may be off by so much (docs/protocol.md)."""
+    half = pose(3, -2, 1, np.pi)
+    pair = silent(half)
+    low, high = sorted(pair.values(), key=lambda robot: robot.identity.author)
+    slow = msgspec.structs.replace(UNKNOWN.placing, units_per_tick=1)
+    config = msgspec.structs.replace(UNKNOWN, placing=slow)
+    again = Agent.restore(high.identity, config, [tx.data for tx in high.ledger])
+    again.tick(0.0)
+    truth = half if low.config.name == "ann" else np.linalg.inv(half)
+    ends = FrameId(low.identity.author), FrameId(high.identity.author)
+    short = quantise_pose(truth)
+    short[:4] = (short[:4] * 0.99952).astype(np.int32)
+    low.observing.relate([Link(*ends, short, 500)], True)
+    low.tick(100.0)
+    for out in low.outbox():
+        again.receive(out.data, 100.0)
+    assert issues(again, 100) and again.unplaced == {}
+
+
+def test_keyframes_of_anchors_that_never_come_keep_nobody_elses_out() -> None:
+    mallory, bob = ChainAuthor("mallory", UNKNOWN), silent()["bob"]
+    ledger = Ledger(UNKNOWN)
+    junk = tuple(
+        Described(cycle, np.zeros((1, 3), np.int32), np.zeros((1, 32), np.uint8))
+        for cycle in range(MAX_KEYFRAMES)
+    )
+    for tx in [mallory.make(payload=Payload(described=junk)), *bob.ledger]:
+        ledger.add(tx)
+    for order in (sorted, lambda chains: sorted(chains, reverse=True)):
+        ledger.chains = {author: ledger.chains[author] for author in order(ledger.chains)}
+        placing = Placing(UNKNOWN.placing, bob.identity.author)
+        placing._take_in(ledger, Consensus(UNKNOWN))  # as in a revision: no anchor is known yet
+        placing._take_in(ledger, bob.consensus)
+        assert sum(map(len, placing._keyframes.values())) == 12
+
+
+def test_a_robot_that_started_often_is_still_placed() -> None:
+    """Each session shows keyframes; the oldest ones make room for those of the newest."""
+    robot, chain, ledger = ChainAuthor("often", UNKNOWN), [], Ledger(UNKNOWN)
+    one = (np.zeros((1, 3), np.int32), np.zeros((1, 32), np.uint8))
+    for session in range(5):
+        cycles = range(100 * session, 100 * session + 100)
+        anchors = tuple(replace(anchor(cycle), session=session) for cycle in cycles)
+        shown = tuple(Described(cycle, *one) for cycle in cycles)
+        chain.append(robot.make(payload=Payload(anchors=anchors, described=shown)))
+    consensus, placing = Consensus(UNKNOWN), Placing(UNKNOWN.placing, robot.identity.author)
+    for tx in chain:
+        ledger.add(tx)
+        consensus.add(tx)
+    placing._take_in(ledger, consensus)
+    held = {frame.session: len(keyframes) for frame, keyframes in placing._keyframes.items()}
+    assert held[4] == 100 and sum(held.values()) <= MAX_KEYFRAMES
+    assert {frame.session for ends in placing._relations for frame in ends} == set(held)
+
+
+def test_a_link_that_was_withdrawn_can_be_published_anew() -> None:
+    """Also while its own withdrawal is not in the ledger yet."""
+    ann = silent()["ann"]
+    again = Agent.restore(ann.identity, UNKNOWN, [tx.data for tx in ann.ledger])
+    assert issues(again, 20)
+    (relation,) = again.placing._relations.values()
+    before = relation.published
+    assert before is not None and relation._withdraw() is not None
+    again.placing._hear(relation, again.consensus)
+    anew = relation._conclude()
+    assert anew is not None and anew.inliers > 0
+
+
 A, B, C, LIAR = (FrameId(bytes([n]) * 8) for n in (1, 2, 3, 9))
 
 
@@ -334,6 +472,27 @@ def test_a_link_that_its_other_end_does_not_bear_out_is_but_a_claim() -> None:
     assert disputed_placed[B][0] == A and disputed_placed[C][1][4] == 3000  # c's own word on c
     agreed = [*joined, link(B, C, 900, 2.0), link(C, B, 900, -2.0)]
     assert place_frames(agreed)[C][0] == A
+
+
+def test_who_places_itself_beside_others_is_not_their_origin() -> None:
+    """Else a stranger with a low id would turn everybody's map, and anew with each link."""
+    low = FrameId(bytes(7) + b"\x01")
+    honest = [link(A, B, 40, 3.0), link(B, A, 50, -3.0)]
+    before, after = place_frames(honest), place_frames([*honest, link(low, B, 1 << 30, 7.0)])
+    assert after[low][0] == A
+    assert [(after[f][0], after[f][1].tolist()) for f in (A, B)] == [
+        (before[f][0], before[f][1].tolist()) for f in (A, B)
+    ]
+    alone = place_frames([link(low, B, 1 << 30, 7.0)])
+    assert alone[B][0] == alone[low][0] == B
+
+
+def test_a_claim_binds_its_target_to_nothing() -> None:
+    """B still places itself beside a robot that is gone, whoever claims to stand beside B."""
+    claim = link(B, A, 60, 1.0)
+    alone, with_lie = place_frames([claim]), place_frames([claim, link(LIAR, B, 1 << 30, 7.0)])
+    assert with_lie[B][0] == alone[B][0] == A
+    assert with_lie[B][1].tolist() == alone[B][1].tolist() and with_lie[LIAR][0] == A
 
 
 def test_a_withdrawn_link_counts_no_more() -> None:
@@ -387,7 +546,7 @@ def test_the_nearest_descriptors_are_the_nearest(reach: int) -> None:
 
 
 def test_described_points_must_be_points() -> None:
-    from dagmap.payload import Payload, decode_payload, encode_payload
+    from dagmap.payload import decode_payload, encode_payload
     from dagmap.wire import Refusal
 
     shown = Described(3, np.array([[1, 2, 3]], np.int32), np.zeros((1, 32), np.uint8))

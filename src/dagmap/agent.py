@@ -77,6 +77,7 @@ class Agent:
         self.sync = Sync(self.ledger, self.config, identity.author)
         self.placing = Placing(self.config.placing, identity.author)
         self.steering = Steering(self.config, identity.author)
+        self.listening = False  # to be told of its own chain first: nothing is issued meanwhile
         self._map: WorldMap | None = None
         self._map_version = -1  # of the consensus, when the map was made
         self._undone = self._applied = 0  # transactions, since the last `MapChanged`
@@ -250,7 +251,7 @@ class Agent:
     @property
     def unplaced(self) -> dict[FrameId, str]:
         """SLAM frames that no links lead to from this robot's, and why: they wait, unmerged."""
-        self._advance()
+        self._catch_up()
         return self.placing.why(self.consensus)
 
     @property
@@ -289,7 +290,8 @@ class Agent:
         """Section 4.2: seal what is valid and may go out, and take it through the door."""
         events: list[Event] = []
         me = self.identity.author
-        allowed = None if self._silenced else self.steering.allowance(now)
+        quiet = self.listening or self._silenced
+        allowed = None if quiet else self.steering.allowance(now)
         if allowed is None:
             return events
         base = self.ledger.features(me)

@@ -99,7 +99,9 @@ class Consensus:
 
     def cut(self, id_: AuthorId, sequence: int) -> None:
         """Leave out everything of an author from `sequence` on: a fork, or a revocation."""
-        self._members -= {k for k in self._members if k[1] == id_ and k[2] >= sequence}
+        gone = {k for k in self._members if k[1] == id_ and k[2] >= sequence}
+        self._members -= gone
+        self._late = [w for w in self._late if isinstance(w, _Cut) or w.key not in gone]
         self._take(_Cut(id_, sequence))
 
     def advance(self, budget: int | None = None, keep: FrameId | None = None) -> tuple[int, int]:
@@ -318,11 +320,13 @@ class Consensus:
         self.frames, self._links_changed = place_frames(links), False
         firm = [link for link in links if not rough(link)]
         self.firm = self.frames if len(firm) == len(links) else place_frames(firm)
-        for author in self.authors.values():
+        frames = before.keys() | self.frames.keys()
+        moved = {f for f in frames if not _alike(before.get(f), self.frames.get(f))}
+        authors = {frame.author for frame in moved} & self.authors.keys()
+        for author in (self.authors[id_] for id_ in authors):
             for cycle, keys in author.seen_in.items():
                 anchor = author.anchors.get(cycle)
-                frame = None if anchor is None else FrameId(author.id, anchor.session)
-                if frame is not None and not _alike(before.get(frame), self.frames.get(frame)):
+                if anchor is not None and FrameId(author.id, anchor.session) in moved:
                     self._restale(keys)
 
     def _apply(self, contribution: Contribution) -> None:

@@ -1,14 +1,15 @@
 """Where every SLAM frame lies in the fleet: the same on every robot, from the links alone.
 
 Per connected component the origin is the frame of the lowest author id (the fleet's own frame has
-author zero). The spanning tree takes links by their standing, then those with the most inliers,
-then the lowest ids:
+author zero) that does not lie there by its own word alone. The spanning tree takes links by their
+standing, then those with the most inliers, then the lowest ids:
   1. a robot's word on where its frame lies in the fleet's own;
   2. an author's links between frames of its own;
   3. links that both ends have published, alike: neither end can be placed by another's word; but
      not where they move a frame further than its configured start may be off;
   4. a robot's word on where its frame lies about in the fleet's own, the least uncertain first;
-  5. what only one end says, where that end stands alone: it places itself, and nobody else.
+  5. what only one end says, where that end stands alone: it places itself, and nobody else. It is
+     a guest there: it is never the origin, and binds its host to nothing.
 """
 
 from __future__ import annotations
@@ -58,11 +59,12 @@ def place_frames(links: Iterable[Link]) -> Placed:
     Each link is its source's author's; a link of 0 inliers is none.
     """
     neighbours: dict[FrameId, list[tuple[FrameId, Int32s]]] = {}
-    for link in _spanning_tree(_edges(links)):
+    tree, guests = _spanning_tree(_edges(links))
+    for link in tree:
         neighbours.setdefault(link.source, []).append((link.target, link.pose))
         neighbours.setdefault(link.target, []).append((link.source, invert(link.pose)))
     placed: Placed = {}
-    for origin in sorted(neighbours):
+    for origin in sorted(neighbours, key=lambda frame: (frame in guests, frame)):
         if origin not in placed:
             _place_component(origin, neighbours, placed)
     return placed
@@ -130,26 +132,25 @@ def _bytes(link: Link) -> tuple[FrameId, FrameId, int, bytes]:
     return (link.source, link.target, link.inliers, link.pose.tobytes())
 
 
-def _spanning_tree(edges: list[_Edge]) -> list[Link]:
-    """Kruskal over the links, best first."""
-    leader: dict[FrameId, FrameId] = {}
-    shared: set[FrameId] = set()  # leaders of components of more than one author
-
-    def find(frame: FrameId) -> FrameId:
-        while (above := leader.get(frame, frame)) != frame:
-            frame = above
-        return frame
-
+def _spanning_tree(edges: list[_Edge]) -> tuple[list[Link], set[FrameId]]:
+    """Kruskal over the links, best first; and the frames that lie there by a claim of theirs."""
+    together: dict[FrameId, set[FrameId]] = {}  # of each frame: those joined with it, itself too
+    guests: set[FrameId] = set()
     tree = []
     for edge in sorted(edges, key=lambda edge: edge.merit):
-        a, b = find(edge.link.source), find(edge.link.target)
-        if a == b or (edge.standing == Standing.CLAIMED and a in shared):
+        source, target = edge.link.source, edge.link.target
+        a, b = together.setdefault(source, {source}), together.setdefault(target, {target})
+        if a is b:
             continue
-        if a.author != b.author or a in shared or b in shared:
-            shared.add(min(a, b))
-        leader[max(a, b)] = min(a, b)
+        if edge.standing == Standing.CLAIMED:
+            if source in guests or any(f.author != source.author for f in a - guests):
+                continue
+            guests |= a
+        less, more = (a, b) if len(a) < len(b) else (b, a)
+        more |= less
+        together.update(dict.fromkeys(less, more))
         tree.append(edge.link)
-    return tree
+    return tree, guests
 
 
 def _place_component(

@@ -1,15 +1,19 @@
-"""Which cycles of the robot's own are kept, with descriptors, to be found by by other robots.
+"""Which cycles of the robot's own are kept, with descriptors, to be found by by other robots; and
+keyframes as they were published, where the newest poses of their anchors put them.
 
 They are sent only where somebody wants them: in a fleet that shares its frame they cost nothing.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
 
 from .config import PlacingConfig
-from .model import Floats, QuantisedCycle, pose_matrix
+from .model import AuthorId, Floats, Int32s, QuantisedCycle, Uint8s, pose_matrix
 from .payload import Described
+from .registration import Views
 
 RECORD = 44  # bytes of a described point on the wire
 _HEAD = 12  # bytes of a record beside its points, at most
@@ -74,3 +78,49 @@ def fill(
         room -= size
         count += 1
     return tuple(described[:count]), described[count:], room
+
+
+@dataclass(slots=True, eq=False)
+class Keyframe:
+    """A published keyframe, carried into its SLAM frame by the newest pose of its anchor."""
+
+    author: AuthorId
+    described: Described
+    pose: Int32s  # (7,) of the anchor
+    place: Floats = field(init=False)  # (4, 4) mm
+    points: Floats = field(init=False)  # (N, 3) mm in the SLAM frame
+    depth: float = field(init=False)  # mm, median distance of a point from the sensor
+    judged: Floats = field(init=False)  # where it was when proposals were last to be judged anew
+
+    def __post_init__(self) -> None:
+        self.depth = float(np.median(np.linalg.norm(self.described.position, axis=1)))
+        self.move(self.pose)
+        self.judged = self.place
+
+    def move(self, pose: Int32s) -> None:
+        self.pose, self.place = pose, pose_matrix(pose)
+        self.place[:3, 3] *= 1000.0
+        turned = self.described.position @ self.place[:3, :3].T
+        self.points = np.asarray(turned + self.place[:3, 3])
+
+    def went_beyond(self, reach: float) -> bool:
+        """Whether its points moved by more, mm, since this was last so."""
+        change = np.abs(self.place - self.judged)[:3] * (self.depth, self.depth, self.depth, 1.0)
+        if change.max() <= reach:
+            return False
+        self.judged = self.place
+        return True
+
+    @property
+    def descriptors(self) -> Uint8s:
+        return self.described.descriptors
+
+
+def views(keyframes: list[Keyframe]) -> Views:
+    """Keyframes of one SLAM frame, in the form that judging takes."""
+    return Views(
+        np.array([keyframe.place for keyframe in keyframes]),
+        [keyframe.points for keyframe in keyframes],
+        [keyframe.descriptors for keyframe in keyframes],
+        float(np.median([keyframe.depth for keyframe in keyframes])) if keyframes else 0.0,
+    )

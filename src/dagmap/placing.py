@@ -14,26 +14,38 @@ contradict each other and are both believable are an ambiguity: then none is pub
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from .config import PlacingConfig
 from .consensus import Consensus
-from .frames import Placed
+from .frames import IDENTITY_POSE, Placed
+from .kernels.geometry import compose
+from .keyframes import Keyframe, views
 from .ledger import Ledger
 from .model import (
+    LIMIT_MM,
     MAX_KEYFRAMES,
     AuthorId,
     Floats,
     FrameId,
     Int32s,
-    Uint8s,
     pose_matrix,
     quantise_pose,
 )
 from .payload import CERTAIN, Described, Link
-from .registration import Evidence, Views, Working, compared, judge, match, register, rivals
+from .registration import (
+    Evidence,
+    Views,
+    Working,
+    compared,
+    inverse,
+    judge,
+    match,
+    register,
+    rivals,
+)
 
 PAIRED = 5  # described points of two keyframes that agree: enough for a proposal
 CLOSE = 0.5  # of the tolerance: so well they agree, since they may lie on one small thing
@@ -45,37 +57,12 @@ CANDIDATES = 8  # proposals of two frames that are kept
 
 
 @dataclass(slots=True, eq=False)
-class _Keyframe:
-    """A foreign or own keyframe, carried into its SLAM frame by the newest pose of its anchor."""
-
-    author: AuthorId
-    described: Described
-    pose: Int32s  # (7,) of the anchor
-    place: Floats = field(init=False)  # (4, 4) mm
-    points: Floats = field(init=False)  # (N, 3) mm in the SLAM frame
-    depth: float = field(init=False)  # mm, median distance of a point from the sensor
-
-    def __post_init__(self) -> None:
-        self.depth = float(np.median(np.linalg.norm(self.described.position, axis=1)))
-        self.move(self.pose)
-
-    def move(self, pose: Int32s) -> None:
-        self.pose, self.place = pose, pose_matrix(pose)
-        self.place[:3, 3] *= 1000.0
-        turned = self.described.position @ self.place[:3, :3].T
-        self.points = np.asarray(turned + self.place[:3, 3])
-
-    @property
-    def descriptors(self) -> Uint8s:
-        return self.described.descriptors
-
-
-@dataclass(slots=True, eq=False)
 class _Candidate:
     """A proposal that was judged."""
 
     pose: Floats  # (4, 4) mm, source into target
     evidence: Evidence
+    between: Floats | None  # (4, 4) mm the same from the one to the other keyframe that agree best
     seen: int  # keyframes of both frames when it was judged
 
 
@@ -84,15 +71,17 @@ class _Relation:
 
     def __init__(self, config: PlacingConfig, source: FrameId, target: FrameId) -> None:
         self._config, self.source, self.target = config, source, target
-        self.here: list[_Keyframe] = []
-        self.there: list[_Keyframe] = []
+        self.here: list[Keyframe] = []
+        self.there: list[Keyframe] = []
         self.candidates: list[_Candidate] = []
+        self.resumed = False  # whether it was seen what an earlier run of this robot has published
         self.published: Link | None = None  # by this robot
         self._weight = 0.0  # of the evidence for it
         self.answer: Link | None = None  # by the other end
         self._answered: Link | None = None  # judged already
         self.reason = "nothing in common was seen yet"
         self.news: list[Link] = []  # to be published
+        self._moves = 0  # of keyframes, since the judgement began that is under way
         self.work = self._work()
 
     def _work(self) -> Iterator[int]:
@@ -101,7 +90,7 @@ class _Relation:
         while True:
             if self.answer is not None and self.answer is not self._answered:
                 self._answered = self.answer
-                yield from self._propose(_inverse(_matrix(self.answer.pose)))
+                yield from self._propose(inverse(_matrix(self.answer.pose)))
             pair = next(pairs)
             if pair is None:
                 yield from self._improve()
@@ -111,7 +100,7 @@ class _Relation:
             if proposal is not None and not self._known(proposal):
                 yield from self._propose(proposal)
 
-    def _pairs(self) -> Iterator[tuple[_Keyframe, _Keyframe] | None]:
+    def _pairs(self) -> Iterator[tuple[Keyframe, Keyframe] | None]:
         """Every pair of keyframes once, also of those that come later; None while there is none."""
         a = b = 0
         while True:
@@ -126,7 +115,7 @@ class _Relation:
             else:
                 yield None
 
-    def _compare(self, one: _Keyframe, other: _Keyframe) -> Floats | None:
+    def _compare(self, one: Keyframe, other: Keyframe) -> Floats | None:
         rows = match(one.descriptors, other.descriptors)
         if len(rows) < PAIRED:
             return None
@@ -141,6 +130,19 @@ class _Relation:
     def _same(self, pose: Floats, known: _Candidate) -> bool:
         return known.evidence.apart(pose, known.pose) <= 4 * self._config.tolerance_mm
 
+    def judge_anew(self) -> None:
+        """Keyframes have moved, and what was proposed with them: it is to be judged again."""
+        self._moves += 1
+        for known in self.candidates:
+            self._follow(known)
+
+    def _follow(self, known: _Candidate) -> None:
+        known.seen = 0
+        if known.between is not None:
+            (i, j), *_ = known.evidence.best
+            back = inverse(self.here[i].place)
+            known.pose = self.there[j].place @ known.between @ back
+
     def _improve(self) -> Working[None]:
         """Judge again what was proposed, once there is much more to judge it by."""
         for known in self.candidates[:]:
@@ -152,7 +154,7 @@ class _Relation:
 
     def _propose(self, pose: Floats) -> Working[None]:
         """Judge a proposal and its rivals, and publish a link if there is news."""
-        here, there = _views(self.here), _views(self.there)
+        here, there, self._moves = views(self.here), views(self.there), 0
         candidate = yield from self._judge(here, there, pose)
         if self._holds(candidate):
             evidence, tolerance = candidate.evidence, self._config.tolerance_mm
@@ -168,7 +170,14 @@ class _Relation:
         evidence = yield from judge(here, there, pose, self._config.tolerance_mm)
         alike = [c for c in self.candidates if self._same(evidence.pose, c)]
         self.candidates = [c for c in self.candidates if c not in alike]
-        alike.append(_Candidate(evidence.pose, evidence, len(here.points) + len(there.points)))
+        between = None
+        if evidence.best:
+            (i, j), *_ = evidence.best
+            between = inverse(there.poses[j]) @ evidence.pose @ here.poses[i]
+        seen = len(here.points) + len(there.points)
+        alike.append(_Candidate(evidence.pose, evidence, between, seen))
+        if self._moves:  # keyframes have moved since the judgement began
+            self._follow(alike[-1])
         best = max(alike, key=lambda c: c.evidence.inliers)  # a bad start may end up beside it
         self.candidates.append(best)
         self.candidates.sort(key=lambda c: (not self._holds(c), -c.evidence.inliers))
@@ -204,9 +213,12 @@ class _Relation:
             return self._withdraw()
         pose = best.pose
         if self.answer is not None and self.target < self.source:  # the lower one's pose counts
-            said = _inverse(_matrix(self.answer.pose))
+            said = inverse(_matrix(self.answer.pose))
             if best.evidence.apart(said, pose) <= self._config.tolerance_mm / 2:
                 pose = said
+        if np.abs(pose[:3, 3]).max() >= LIMIT_MM:
+            self.reason = "it lies beyond 2^29 mm"
+            return self._withdraw()
         return self._publish(pose, best.evidence)
 
     def _publish(self, pose: Floats, evidence: Evidence) -> Link | None:
@@ -236,8 +248,8 @@ class Placing:
     def __init__(self, config: PlacingConfig, me: AuthorId) -> None:
         self._config, self._me = config, me
         self._read: dict[AuthorId, int] = {}  # transactions of each chain that were looked at
-        self._waiting: list[tuple[AuthorId, Described]] = []  # their anchors are not known yet
-        self._keyframes: dict[FrameId, list[_Keyframe]] = {}
+        self._waiting: dict[AuthorId, list[Described]] = {}  # their anchors are not known yet
+        self._keyframes: dict[FrameId, list[Keyframe]] = {}
         self._relations: dict[tuple[FrameId, FrameId], _Relation] = {}
         self._turn = 0
         self.spent = 0  # units of work of the last step
@@ -297,36 +309,44 @@ class Placing:
                 self._forget(author)
                 read = 0
             for tx in chain.main[read : chain.end]:
-                self._waiting += [(author, keyframe) for keyframe in tx.payload.described]
+                self._waiting.setdefault(author, []).extend(tx.payload.described)
             self._read[author] = chain.end
-        waiting, self._waiting = self._waiting, []
-        for author, keyframe in waiting:
-            self._enter(author, keyframe, consensus)
+        for author, waiting in self._waiting.items():
+            late = [
+                keyframe for keyframe in waiting if not self._enter(author, keyframe, consensus)
+            ]
+            self._waiting[author] = late[:MAX_KEYFRAMES]
         self._follow(consensus)
 
     def _forget(self, author: AuthorId) -> None:
         """A fork or a revocation has cut a chain: begin anew with its author."""
-        self._waiting = [(id_, k) for id_, k in self._waiting if id_ != author]
+        self._waiting.pop(author, None)
         for frame in [frame for frame in self._keyframes if frame.author == author]:
-            del self._keyframes[frame]
-        for ends in [
-            ends for ends in self._relations if author in (ends[0].author, ends[1].author)
-        ]:
+            self._drop(frame)
+
+    def _drop(self, frame: FrameId) -> None:
+        del self._keyframes[frame]
+        for ends in [ends for ends in self._relations if frame in ends]:
             del self._relations[ends]
 
-    def _enter(self, author: AuthorId, keyframe: Described, consensus: Consensus) -> None:
+    def _enter(self, author: AuthorId, keyframe: Described, consensus: Consensus) -> bool:
+        """Compare from now on; where the author has too many, instead of its oldest session.
+
+        False: its anchor is not known yet.
+        """
         known = consensus.authors.get(author)
         anchor = None if known is None else known.anchors.get(keyframe.cycle)
         if anchor is None:
-            if len(self._waiting) < MAX_KEYFRAMES:
-                self._waiting.append((author, keyframe))
-            return
+            return False
         frame = FrameId(author, anchor.session)
-        count = sum(len(k) for f, k in self._keyframes.items() if f.author == author)
-        if count >= MAX_KEYFRAMES:
-            return
-        self._keyframes.setdefault(frame, []).append(_Keyframe(author, keyframe, anchor.pose))
+        theirs = [f for f in self._keyframes if f.author == author]
+        if sum(len(self._keyframes[f]) for f in theirs) >= MAX_KEYFRAMES:
+            if min(theirs) >= frame:
+                return True
+            self._drop(min(theirs))
+        self._keyframes.setdefault(frame, []).append(Keyframe(author, keyframe, anchor.pose))
         self._relate(frame)
+        return True
 
     def _relate(self, frame: FrameId) -> None:
         """Every own frame against every other one; of two own ones the later one is the source."""
@@ -342,12 +362,16 @@ class Placing:
                     self._relations[source, target] = relation
 
     def _follow(self, consensus: Consensus) -> None:
-        for keyframes in self._keyframes.values():
+        for frame, keyframes in self._keyframes.items():
+            anchors, far = consensus.authors[frame.author].anchors, False
             for keyframe in keyframes:
-                anchors = consensus.authors[keyframe.author].anchors
                 anchor = anchors.get(keyframe.described.cycle)
                 if anchor is not None and anchor.pose is not keyframe.pose:
                     keyframe.move(anchor.pose)
+                    far |= keyframe.went_beyond(self._config.tolerance_mm / 2)
+            for relation in self._relations.values() if far else ():
+                if frame in (relation.source, relation.target):
+                    relation.judge_anew()
 
     def _search(self, consensus: Consensus) -> list[Link]:
         """Spend this tick's units on the relations in turn."""
@@ -368,32 +392,17 @@ class Placing:
     def _hear(self, relation: _Relation, consensus: Consensus) -> None:
         """What both ends have published so far."""
         ends = relation.source, relation.target
-        mine = consensus.author(self._me).links.get(ends)
-        if relation.published is None and mine is not None and 0 < mine.inliers < CERTAIN:
-            relation.published = mine  # by an earlier run of this robot
+        mine = None if relation.resumed else consensus.author(self._me).links.get(ends)
+        if mine is not None and 0 < mine.inliers < CERTAIN:
+            relation.published = mine
+        relation.resumed = True
         theirs = consensus.authors.get(relation.target.author)
         answer = None if theirs is None else theirs.links.get((relation.target, relation.source))
         relation.answer = answer if answer is not None and answer.inliers else None
 
 
-def _views(keyframes: list[_Keyframe]) -> Views:
-    return Views(
-        np.array([keyframe.place for keyframe in keyframes]),
-        [keyframe.points for keyframe in keyframes],
-        [keyframe.descriptors for keyframe in keyframes],
-        float(np.median([keyframe.depth for keyframe in keyframes])) if keyframes else 0.0,
-    )
-
-
 def _matrix(pose: Int32s) -> Floats:
-    """(4, 4) mm of a (7,) pose."""
-    out = pose_matrix(pose)
+    """(4, 4) mm of a (7,) pose, whose quaternion may be off by a thousandth."""
+    out = pose_matrix(compose(pose, np.array(IDENTITY_POSE, np.int32)))
     out[:3, 3] *= 1000.0
-    return out
-
-
-def _inverse(pose: Floats) -> Floats:
-    out = np.eye(4)
-    out[:3, :3] = pose[:3, :3].T
-    out[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
     return out

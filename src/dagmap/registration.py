@@ -108,6 +108,14 @@ def carry(pose: Floats, points: Floats) -> Floats:
     return np.asarray(turned + pose[..., None, :3, 3])
 
 
+def inverse(pose: Floats) -> Floats:
+    """(4, 4) the motion that undoes a rigid one."""
+    out = np.eye(4)
+    out[:3, :3] = pose[:3, :3].T
+    out[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return out
+
+
 def register(source: Floats, target: Floats, tolerance: float) -> tuple[Floats, Bools] | None:
     """The motion (4, 4) that most of the paired points (N, 3) agree on, and which ones do (N,).
 

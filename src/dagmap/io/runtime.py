@@ -127,12 +127,14 @@ class Runtime:
         before, begun = len(ledger.chain(me).main), self.now
         if not before:
             return
+        self.agent.listening = True  # a number that is used up must not be signed again
         fetched = begun + seconds + _FETCH * self.agent.config.sync.retry_period
         while not self._stopping and (
             (sync.promised(me) and self.now < fetched)
             or (not self._heard_all(begun) and self.now < begun + seconds)
         ):
             self._step()
+        self.agent.listening = False
         self.agent.resume()
         if found := len(ledger.chain(me).main) - before:
             meaning = "the ledger was an older copy; the others knew what it lacked"
