@@ -1,4 +1,4 @@
-"""Which cycles of the robot's own are kept, with descriptors, to be found by by other robots; and
+"""Which cycles of the robot's own are kept, with descriptors, to be found by other robots; and
 keyframes as they were published, where the newest poses of their anchors put them.
 
 They are sent only where somebody wants them: in a fleet that shares its frame they cost nothing.
@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .config import PlacingConfig
-from .model import AuthorId, Floats, Int32s, QuantisedCycle, Uint8s, pose_matrix
+from .kernels.geometry import compose
+from .model import QUATERNION_ONE, AuthorId, Floats, Int32s, QuantisedCycle, Uint8s, pose_matrix
 from .payload import Described
 from .registration import Views
 
@@ -124,3 +125,11 @@ def views(keyframes: list[Keyframe]) -> Views:
         [keyframe.descriptors for keyframe in keyframes],
         float(np.median([keyframe.depth for keyframe in keyframes])) if keyframes else 0.0,
     )
+
+
+def matrix_of(pose: Int32s) -> Floats:
+    """(4, 4) mm of a (7,) pose, whose quaternion may be off by a thousandth."""
+    still = np.array((QUATERNION_ONE, 0, 0, 0, 0, 0, 0), np.int32)
+    out = pose_matrix(compose(pose, still))
+    out[:3, 3] *= 1000.0
+    return out

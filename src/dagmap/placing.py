@@ -20,9 +20,8 @@ import numpy as np
 
 from .config import PlacingConfig
 from .consensus import Consensus
-from .frames import IDENTITY_POSE, Placed
-from .kernels.geometry import compose
-from .keyframes import Keyframe, views
+from .frames import Placed
+from .keyframes import Keyframe, matrix_of, views
 from .ledger import Ledger
 from .model import (
     LIMIT_MM,
@@ -30,8 +29,6 @@ from .model import (
     AuthorId,
     Floats,
     FrameId,
-    Int32s,
-    pose_matrix,
     quantise_pose,
 )
 from .payload import CERTAIN, Described, Link
@@ -90,7 +87,7 @@ class _Relation:
         while True:
             if self.answer is not None and self.answer is not self._answered:
                 self._answered = self.answer
-                yield from self._propose(inverse(_matrix(self.answer.pose)))
+                yield from self._propose(inverse(matrix_of(self.answer.pose)))
             pair = next(pairs)
             if pair is None:
                 yield from self._improve()
@@ -213,7 +210,7 @@ class _Relation:
             return self._withdraw()
         pose = best.pose
         if self.answer is not None and self.target < self.source:  # the lower one's pose counts
-            said = inverse(_matrix(self.answer.pose))
+            said = inverse(matrix_of(self.answer.pose))
             if best.evidence.apart(said, pose) <= self._config.tolerance_mm / 2:
                 pose = said
         if np.abs(pose[:3, 3]).max() >= LIMIT_MM:
@@ -224,7 +221,7 @@ class _Relation:
     def _publish(self, pose: Floats, evidence: Evidence) -> Link | None:
         before = self.published
         if before is not None:
-            moved = evidence.apart(_matrix(before.pose), pose) > self._config.tolerance_mm / 2
+            moved = evidence.apart(matrix_of(before.pose), pose) > self._config.tolerance_mm / 2
             if not moved and evidence.weight < GROWTH * self._weight:
                 return None
         self._weight = evidence.weight
@@ -399,10 +396,3 @@ class Placing:
         theirs = consensus.authors.get(relation.target.author)
         answer = None if theirs is None else theirs.links.get((relation.target, relation.source))
         relation.answer = answer if answer is not None and answer.inliers else None
-
-
-def _matrix(pose: Int32s) -> Floats:
-    """(4, 4) mm of a (7,) pose, whose quaternion may be off by a thousandth."""
-    out = pose_matrix(compose(pose, np.array(IDENTITY_POSE, np.int32)))
-    out[:3, 3] *= 1000.0
-    return out
