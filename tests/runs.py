@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dagmap.cli.replay import Replay
+from dagmap.io.sources import Options
 from robots import record
 
 NAMES = ("red", "blue")
@@ -16,7 +17,7 @@ def replay_of(folder: Path) -> Path:
     out = folder / "out"
     code = Replay(
         recordings=recordings, out=out, config_file=None, loss=0.0, late=[], seed=0,
-        max_features=1000, camera=None, force=False, json=False,
+        options=Options(), unknown_frames=False, force=False, json=False,
     ).run()  # fmt: skip
     assert code == 0
     return out
