@@ -54,7 +54,6 @@ class Asked(NamedTuple):
     held: int  # where the range begins, or how far the answer has come
     end: int
     until: float  # s, when it is overdue
-    tries: int = 0  # in vain, since the last that came
 
 
 class Sync:
@@ -218,9 +217,7 @@ class Sync:
             wanted = self._wanted(head, waiting)
             before = self._asked.get(head.author)
             if wanted is not None and (before is None or now >= before.until):
-                tries = 0 if before is None else before.tries + 1
-                patience = self._patience(peer) * (1 << min(tries, 2))  # slow, rather than lost?
-                self._asked[head.author] = Asked(*wanted, now + patience, tries)
+                self._asked[head.author] = Asked(*wanted, now + self._patience(peer))
                 self._asked.move_to_end(head.author)
                 if len(self._asked) > 2 * _MAX_HEADS:
                     self._asked.popitem(last=False)
