@@ -54,6 +54,15 @@ def frame_name(name: str) -> str:
     return name.rstrip("\0").lstrip("/")
 
 
+def stamp_of(message: Any) -> float:
+    """s, of the header. Raises Unusable where it is empty."""
+    stamp = message.header.stamp
+    seconds = stamp.sec + stamp.nanosec / 1e9
+    if not seconds:
+        raise Unusable("its header has no stamp; the driver must give it one")
+    return float(seconds)
+
+
 def cloud_arrays(message: Any) -> tuple[Floats, Uint8s | None]:
     """(N, 3) m and (N, 3) RGB or None of a PointCloud2. Raises Unusable."""
     fields = {f.name: f for f in message.fields}

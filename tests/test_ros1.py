@@ -1,0 +1,151 @@
+"""ROS 1 for real: roscore, a bag for each of three robots, and their agents as rospy nodes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ros1
+from bags import Make, Message, room, write_bag
+from robots import Robot, agreed, until
+
+WHY_NOT = ros1.missing()
+needs_ros = pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT)
+ROS = "[ros]\nvoxel = 0.02\nmax_features = 5000\npublish_period = 0.2\n"
+
+
+class Listener:
+    """What somebody on the same master hears."""
+
+    def __init__(self, port: int, *topics: str) -> None:
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+        self.process = ros1.start(port, "listen", *topics, **pipes)
+        self._last: dict[str, Any] = {}
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            said = json.loads(line)
+            self._last[said["topic"]] = said
+
+    def last(self, topic: str) -> Any:
+        return self._last.get(topic)
+
+
+@contextmanager
+def ended(*processes: subprocess.Popen[str]) -> Iterator[None]:
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait(30)
+            for pipe in (process.stdin, process.stdout):
+                if pipe is not None:
+                    pipe.close()
+
+
+def walk(make: Make, number: int) -> list[Message]:
+    """The robot `number` of three sees its part of the room and 1 m of the next one's."""
+    world = room()
+    low = -3 + 2 * number
+    part = world[(world[:, 1] >= low - 0.5) & (world[:, 1] <= low + 2.5)]
+    out = [make.mount(f"lidar{number}"), *make.odometries()]
+    for i in range(5):
+        stamp = 1.05 + 0.1 * i
+        sensor = make.sensor(stamp)
+        seen = (part - sensor[:3, 3]) @ sensor[:3, :3]
+        out.append(make.cloud(stamp, seen, f"lidar{number}"))
+    return sorted(out, key=lambda message: message[2])
+
+
+def start_node(port: int, robot: Robot, *more: str) -> subprocess.Popen[str]:
+    """`dagmap-ros1` in a namespace that is called like the robot."""
+    argv = ["-c", "from dagmap.cli.ros import ros1; ros1()"]
+    remaps = [f"_config:={robot.write()}", f"__ns:=/{robot.name}", *more]
+    with (robot.folder / f"{robot.name}.err").open("w") as log:
+        return subprocess.Popen(
+            [sys.executable, *argv, *remaps], env=ros1.environment(port), stderr=log, text=True
+        )
+
+
+@needs_ros
+def test_three_agents_map_what_is_played_and_the_merged_cloud_comes_back(tmp_path: Path) -> None:
+    make = Make(ros2=False)
+    a, b, c = (Robot(None, tmp_path, name, more=ROS) for name in "abc")  # type: ignore[arg-type]
+    b.connect, c.connect = (a.port,), (b.port,)
+    bags = [write_bag(tmp_path / f"{i}.bag", make, walk(make, i)) for i in range(3)]
+    topics = ("/a/dagmap/map", "/b/dagmap/map", "/c/dagmap/map", "/a/dagmap/graph")
+    with ExitStack() as stack:
+        port = stack.enter_context(ros1.roscore())
+        nodes = [start_node(port, robot) for robot in (a, b, c)]
+        stack.enter_context(ended(*nodes))
+        listener = Listener(port, *topics, "/diagnostics", "/tf")
+        stack.enter_context(ended(listener.process))
+        players = [
+            ros1.start(port, "play", str(bag), f"/{name}", stdin=subprocess.PIPE)
+            for bag, name in zip(bags, "abc", strict=True)
+        ]
+        stack.enter_context(ended(*players))
+        until(lambda: agreed(a, b, c, authors=3), "three robots to agree")
+
+        def whole(topic: str) -> Any:
+            said = listener.last(topic)
+            if not said or not said["rows"]:
+                return None
+            rows = np.array(said["rows"])
+            ends = rows[:, 1].min(), rows[:, 1].max()
+            both = rows[:, said["names"].index("witnesses")].max() == 2
+            return said if ends[0] < -2.9 and ends[1] > 2.9 and both else None
+
+        for topic in topics[:3]:
+            said = until(lambda topic=topic: whole(topic), f"the merged cloud on {topic}")
+            names = ["x", "y", "z", "rgb", "state", "hits", "misses", "witnesses"]
+            assert (said["frame"], said["names"]) == ("fleet", names)
+            rows = np.array(said["rows"])
+            off = np.abs(rows[:, :3, None] - [[-4, 4], [-3, 3], [-1, 2]]).min(axis=(1, 2))
+            assert np.quantile(off, 0.99) < 0.02
+        graph = until(lambda: listener.last("/a/dagmap/graph"), "the DAG")
+        assert graph["type"] == 5 and graph["points"] > 100
+        assert until(lambda: listener.last("/diagnostics"), "diagnostics")["level"] == 0
+        until(lambda: ["fleet", "odom"] in (listener.last("/tf") or {"frames": []})["frames"])
+        for node in nodes:
+            node.terminate()
+        assert [node.wait(60) for node in nodes] == [0, 0, 0]
+
+
+@needs_ros
+def test_parameters_replace_what_the_file_says_and_wrong_ones_are_named(tmp_path: Path) -> None:
+    a = Robot(None, tmp_path, "a", more=ROS)  # type: ignore[arg-type]
+    with ros1.roscore() as port:
+        node = start_node(port, a, "_cloud:=/lidar/points", "_voxel:=0.5")
+        listener = Listener(port, "/a/dagmap/map")
+        with ended(node, listener.process):
+            until(lambda: listener.last("/a/dagmap/map"), "an empty map")
+            assert "/lidar/points" in _subscriptions(port)
+        for wrong, said in (("_voxle:=1", "voxle"), ("_voxel:=0", "0.001 to 1000 m is wanted")):
+            node = start_node(port, a, wrong)
+            with ended(node):
+                assert node.wait(60) == 2
+            assert said in a.log and "Traceback" not in a.log
+
+
+def _subscriptions(port: int) -> set[str]:
+    """What the master knows."""
+    code = "import rosgraph; print([t for t, _ in rosgraph.Master('/x').getSystemState()[1]])"
+    argv = [sys.executable, "-c", code]
+    done = subprocess.run(
+        argv, env=ros1.environment(port), capture_output=True, text=True, check=True, timeout=60
+    )
+    return set(json.loads(done.stdout.replace("'", '"')))
