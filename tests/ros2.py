@@ -7,6 +7,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -83,10 +84,18 @@ class Ros2:
         topic, kind, _, said = message
         name = topic if topic.startswith("/tf") else namespace + topic
         if name not in self._publishers:
-            self._publishers[name] = sdk.ROS2Publisher(name, kind, domain_id=DOMAIN)
-            self._open.append(self._publishers[name])
+            self._publishers[name] = self._publisher(name, kind)
         fields = {field.name: getattr(said, field.name) for field in dataclasses.fields(said)}
         self._publishers[name].publish(**{k: v for k, v in fields.items() if k[:2] != "__"})
+
+    def _publisher(self, name: str, kind: str) -> Any:
+        """One that waits where the network is busy: by default what is too much is dropped."""
+        made = sdk.ROS2Publisher(name, kind, domain_id=DOMAIN)
+        made.pub.undeclare()
+        control = zenoh.CongestionControl.BLOCK
+        made.pub = self.session.session.declare_publisher(made.keyexpr, congestion_control=control)
+        self._open.append(made)
+        return made
 
     def listen(self, topic: str, kind: str, qos: str | None = None) -> None:
         def take(message: Any) -> None:
@@ -108,9 +117,10 @@ class Ros2:
             return []
         return list(info.publishers if publishers else info.subscribers)
 
-    def wait_for_listener(self, *topics: str) -> None:
+    def wait_for_listener(self, *topics: str, count: int = 1) -> None:
         for topic in topics:
-            until(lambda topic=topic: self.endpoints(topic), f"somebody to subscribe to {topic}")
+            found = partial(self.endpoints, topic)
+            until(lambda found=found: len(found()) >= count, f"{count} to subscribe to {topic}")
 
     def close(self) -> None:
         for each in self._open:

@@ -20,7 +20,7 @@ from robots import Robot, agreed, until
 
 WHY_NOT = ros1.missing()
 needs_ros = pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT)
-ROS = "[ros]\nvoxel = 0.02\nmax_features = 5000\npublish_period = 0.2\n"
+ROS = "[ros]\nvoxel = 0.02\nmax_features = 5000\npublish_period = 0.2\npatience = 60.0\n"
 
 
 class Listener:
@@ -41,6 +41,15 @@ class Listener:
 
     def last(self, topic: str) -> Any:
         return self._last.get(topic)
+
+    def __enter__(self) -> Listener:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        with ended(self.process):
+            assert self.process.stdin is not None
+            self.process.stdin.close()  # it says its last line, and ends
+            self._thread.join(60)
 
 
 @contextmanager
@@ -91,8 +100,7 @@ def test_three_agents_map_what_is_played_and_the_merged_cloud_comes_back(tmp_pat
         port = stack.enter_context(ros1.roscore())
         nodes = [start_node(port, robot) for robot in (a, b, c)]
         stack.enter_context(ended(*nodes))
-        listener = Listener(port, *topics, "/diagnostics", "/tf")
-        stack.enter_context(ended(listener.process))
+        listener = stack.enter_context(Listener(port, *topics, "/diagnostics", "/tf"))
         players = [
             ros1.start(port, "play", str(bag), f"/{name}", stdin=subprocess.PIPE)
             for bag, name in zip(bags, "abc", strict=True)
@@ -130,11 +138,10 @@ def test_parameters_replace_what_the_file_says_and_wrong_ones_are_named(tmp_path
     a = Robot(None, tmp_path, "a", more=ROS)  # type: ignore[arg-type]
     with ros1.roscore() as port:
         node = start_node(port, a, "_cloud:=/lidar/points", "_voxel:=0.5")
-        listener = Listener(port, "/a/dagmap/map")
-        with ended(node, listener.process):
+        with ended(node), Listener(port, "/a/dagmap/map") as listener:
             until(lambda: listener.last("/a/dagmap/map"), "an empty map")
             assert "/lidar/points" in _subscriptions(port)
-        for wrong, said in (("_voxle:=1", "voxle"), ("_voxel:=0", "0.001 to 1000 m is wanted")):
+        for wrong, said in (("_voxle:=1", "voxle"), ("_patience:=100", "0.0 to 60.0 is wanted")):
             node = start_node(port, a, wrong)
             with ended(node):
                 assert node.wait(60) == 2

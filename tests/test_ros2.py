@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zenoh
 
 from bags import Make, room
 from dagmap.io.ros.rmw import Node, Qos, Topic, attachment, gid
@@ -46,7 +47,7 @@ def ros(tmp_path: Path, make: Make) -> Iterator[Ros2]:
 
 
 def table(port: int, namespace: str, **more: object) -> str:
-    more = {"publish_period": 0.2, **more}
+    more = {"publish_period": 0.2, "patience": 60.0, **more}
     lines = "".join(f"{key} = {value!r}\n" for key, value in more.items()).replace("'", '"')
     return (
         f"[ros]\nvoxel = 0.02\n{lines}"
@@ -93,6 +94,7 @@ def test_two_robots_map_what_ros_publishes_and_publish_what_both_know(
         for name in ("a", "b"):
             ros.listen(f"/{name}/dagmap/map", MAP)
             ros.wait_for_listener(f"/{name}/points", f"/{name}/odom")
+        ros.wait_for_listener("/tf_static", count=2)
         ros.listen("/diagnostics", DIAGNOSTICS)
         ros.listen("/a/dagmap/graph", GRAPH)
         ros.listen("/tf", "tf2_msgs/msg/TFMessage")
@@ -188,13 +190,14 @@ def test_bad_messages_are_told_of_and_stop_nothing(
     a = Robot(nursery, tmp_path, "a", more=table(ros.port, "/"))
     with running(a):
         a.start()
-        ros.wait_for_listener("/points", "/odom")
+        ros.wait_for_listener("/points", "/odom", "/tf_static")
         ros.listen("/diagnostics", DIAGNOSTICS)
         topic, kind, _, cloud = make.cloud(1.0, room())
         ros.publish("", (topic, kind, 1.0, make.cloud(1.0, room(), row_step=1 << 30)[3]))
         key = Node(DOMAIN, "x", "/", "x").key(Topic(topic, kind, Types(True).hash(kind)))
         for junk in (b"", b"\0", bytes(100), bytes(make.types.serialize_cdr(cloud, kind))[:-20]):
-            ros.session.session.put(key, junk)
+            block = zenoh.CongestionControl.BLOCK
+            ros.session.session.put(key, junk, congestion_control=block)
         ros.publish("", make.cloud(0.0, room()))  # no stamp
         drive(ros, make, "", side=1)
         until(lambda: a.answer()["cycles"] == 5, "the good ones")

@@ -1,0 +1,228 @@
+"""Messages of a robot's ROS as cycles: what waits, what is dropped, and what is told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bags import Make, Message, pose_at, room
+from dagmap import Agent, Config, Cycle, Identity
+from dagmap.io.ros import telling
+from dagmap.io.ros.config import RosConfig
+from dagmap.io.ros.feed import Feed, wanted
+from dagmap.io.ros.types import Types
+from dagmap.io.settings import load_settings
+from dagmap.io.sources._poses import inverse
+from dagmap.io.sources._ros import Unusable, cloud_arrays, transforms
+from dagmap.model import ConfigError
+from test_rtabmap_msgs import data, drift, graph, moved, node
+
+MAKE = Make(ros2=True)
+ROLES = {"/points": "cloud", "/odom": "odometry", "/tf": "tf", "/tf_static": "tf_static"}
+
+
+def give(feed: Feed, *messages: Message, now: float = 0.0) -> list[Cycle]:
+    return [cycle for topic, _, _, said in messages for cycle in feed.take(ROLES[topic], said, now)]
+
+
+def cloud(stamp: float, frame: str = "lidar") -> Message:
+    return MAKE.cloud(stamp, room(), frame)
+
+
+class TestPoses:
+    def test_a_cloud_waits_for_the_pose_behind_it(self) -> None:
+        feed = Feed(RosConfig())
+        give(feed, MAKE.mount(), MAKE.odometry(1.0))
+        assert give(feed, cloud(1.05)) == [] and feed.waiting == 1
+        (cycle,) = give(feed, MAKE.odometry(1.1))
+        assert np.allclose(cycle.pose, MAKE.sensor(1.05), atol=1e-9)
+        assert (cycle.stamp, feed.waiting, feed.problem) == (1.05, 0, None)
+
+    def test_one_whose_pose_does_not_come_is_left_out_in_time(self) -> None:
+        feed = Feed(RosConfig(patience=1.0))
+        give(feed, MAKE.mount(), MAKE.odometry(1.0), cloud(1.05), now=10.0)
+        assert feed.tick(10.9) == [] and feed.waiting == 1
+        assert feed.tick(11.1) == [] and feed.waiting == 0
+        assert (feed.dropped["clouds"], feed.problem) == (1, "no pose for its moment")
+        (cycle,) = give(feed, cloud(1.15), MAKE.odometry(1.2), now=12.0)
+        assert cycle.stamp == 1.15 and feed.problem is None
+
+    def test_the_newest_pose_will_do_where_it_is_near(self) -> None:
+        feed = Feed(RosConfig(patience=1.0))
+        give(feed, MAKE.mount(), MAKE.odometry(1.04), cloud(1.05), now=10.0)
+        (cycle,) = feed.tick(11.1)
+        assert np.allclose(cycle.pose, MAKE.sensor(1.04))
+
+    def test_without_the_mounting_it_says_what_lacks(self) -> None:
+        feed = Feed(RosConfig(patience=0.0))
+        give(feed, MAKE.odometry(1.0), MAKE.odometry(1.1), cloud(1.05))
+        assert feed.dropped["clouds"] == 1
+        assert feed.problem == "no pose for its moment"
+
+    def test_by_tf_alone(self) -> None:
+        feed = Feed(RosConfig(odometry=""))
+        assert [topic.role for topic in wanted(RosConfig(odometry=""))] == [
+            "cloud", "tf", "tf_static",
+        ]  # fmt: skip
+        give(feed, MAKE.mount(), MAKE.tf(1.0, "map", "base_link", pose_at(1.0), False), cloud(1.05))
+        assert feed.waiting == 1
+        (cycle,) = give(feed, MAKE.tf(1.1, "map", "base_link", pose_at(1.1), False))
+        assert np.allclose(cycle.pose, MAKE.sensor(1.05), atol=1e-9)
+        name, pose = feed.map_frame() or ("", np.zeros(0))
+        assert name == "map" and np.allclose(pose, np.eye(4))
+
+    def test_the_map_frame_is_the_root_above_the_odometry(self) -> None:
+        feed = Feed(RosConfig())
+        give(feed, MAKE.mount(), MAKE.odometry(1.0), MAKE.odometry(1.2))
+        assert feed.map_frame() == ("odom", pytest.approx(np.eye(4)))
+        give(feed, MAKE.tf(1.2, "map", "odom", moved(3.0), False))
+        name, pose = feed.map_frame() or ("", np.zeros(0))
+        assert name == "map" and np.allclose(pose, inverse(moved(3.0)))
+
+    def test_what_is_told_of_the_fleet_is_not_taken_for_news(self) -> None:
+        feed = Feed(RosConfig())
+        give(feed, MAKE.odometry(1.0), MAKE.tf(1.0, "fleet", "odom", moved(9.0), False))
+        assert feed.map_frame() == ("odom", pytest.approx(np.eye(4)))
+
+
+class TestBounds:
+    def test_clouds_that_wait(self) -> None:
+        feed = Feed(RosConfig(patience=60.0))
+        for i in range(100):
+            give(feed, cloud(1.0 + i))
+        assert feed.waiting == 32 and feed.dropped["clouds"] == 68
+
+    def test_poses_are_let_go_of(self) -> None:
+        feed = Feed(RosConfig())
+        give(feed, MAKE.mount())
+        for i in range(2000):
+            give(feed, MAKE.odometry(0.1 * i), MAKE.tf(0.1 * i, "x", "y", np.eye(4), False))
+        assert len(feed._poses.trajectory) < 700
+        assert len(feed._poses.tree._moving["y"]) < 700
+
+    def test_frames(self) -> None:
+        feed = Feed(RosConfig())
+        for i in range(3000):
+            give(feed, MAKE.tf(1.0, "map", f"frame{i}", np.eye(4), True))
+        assert len(feed._poses.tree) == 1000
+
+
+class TestStamps:
+    def ready(self) -> Feed:
+        feed = Feed(RosConfig())
+        give(feed, MAKE.mount(), *(MAKE.odometry(10.0 + 0.1 * i) for i in range(10)))
+        assert len(give(feed, cloud(10.55))) == 1
+        return feed
+
+    def test_that_do_not_rise_are_refused(self) -> None:
+        with pytest.raises(Unusable, match="its stamp 10.550000 does not come after"):
+            give(self.ready(), cloud(10.55))
+
+    def test_that_are_missing_are_refused(self) -> None:
+        with pytest.raises(Unusable, match="no stamp"):
+            give(Feed(RosConfig()), cloud(0.0))
+
+    def test_a_clock_that_starts_anew_is_a_new_session(self) -> None:
+        feed = self.ready()
+        give(feed, MAKE.odometry(1.0), MAKE.odometry(1.1))
+        (cycle,) = give(feed, cloud(1.05))
+        assert (cycle.session, cycle.stamp) == (1, 1.05)
+        assert np.allclose(cycle.pose, MAKE.sensor(1.05), atol=1e-9)  # what is mounted stays
+
+
+def test_map_data_feeds_nodes_and_moves() -> None:
+    feed = Feed(RosConfig(map_data="mapData", map_graph="mapGraph"), session=3)
+    words = np.array([[1.0, 0, 0]])
+    poses = {n: drift(n) @ pose_at(float(n)) for n in (1, 2)}
+    for n in (1, 2):
+        said = data(n, [node(n, n, poses[n], words)], {k: poses[k] for k in range(1, n + 1)})[3]
+        (cycle,) = feed.take("map_data", said, 0.0)
+        assert (cycle.stamp, cycle.session) == (n, 3)
+    closed = {n: drift(1) @ pose_at(float(n)) for n in (1, 2)}
+    (cycle,) = feed.take("map_graph", graph(closed, 3.0), 0.0)
+    assert cycle.moved is not None and np.asarray(cycle.moved[0]).tolist() == [2.0]
+    assert (feed.map_frame() or ("",))[0] == "map"
+    with pytest.raises(Unusable, match="9 nodes are named"):
+        wrong = graph(closed, 4.0, poses_id=np.arange(9, dtype=np.int32))
+        feed.take("map_graph", wrong, 0.0)
+
+
+@pytest.fixture(scope="module")
+def agent() -> Agent:
+    agent = Agent(Identity.from_seed(bytes(32)), Config(name="r1"))
+    rng = np.random.default_rng(1)
+    points = rng.uniform([2, -1, -1], [2.01, 1, 1], (3000, 3))
+    colors = np.full((3000, 3), (1, 2, 3), np.uint8)
+    agent.observe(Cycle(1.0, np.eye(4), points, colors=colors), 0.0)
+    for i in range(30):
+        agent.tick(1.0 + i)
+    agent.settle()
+    return agent
+
+
+class TestTelling:
+    @pytest.mark.parametrize("ros2", [True, False])
+    def test_the_map(self, agent: Agent, ros2: bool) -> None:
+        types, world = Types(ros2), agent.map
+        raw = telling.map_message(types, world, 12.5, "fleet", most=10**6)
+        message = types.decode(telling.CLOUD, raw)
+        points, colors = cloud_arrays(message)
+        assert np.allclose(points, world.positions[world.kept], atol=1e-5)
+        assert colors is not None and (colors == (1, 2, 3)).all()
+        stamp = message.header.stamp
+        assert (stamp.sec, stamp.nanosec, message.header.frame_id) == (12, 500_000_000, "fleet")
+        few = types.decode(telling.CLOUD, telling.map_message(types, world, 0.0, "x", most=100))
+        assert few.width == 100
+
+    @pytest.mark.parametrize("ros2", [True, False])
+    def test_a_transform(self, ros2: bool) -> None:
+        types, pose = Types(ros2), pose_at(3.0)
+        raw = telling.transform_message(types, pose, "fleet", "map", 1.0)
+        (found,) = transforms(types.decode(telling.TRANSFORMS, raw))
+        assert found[:3] == ("fleet", "map", 1.0) and np.allclose(found[3], pose, atol=1e-8)
+
+    def test_the_graph_in_the_robots_map_frame(self) -> None:
+        types = Types(True)
+        edges = np.arange(12.0).reshape(2, 2, 3)
+        raw = telling.graph_message(types, edges, moved(10.0), 1.0, "map")
+        (marker,) = types.decode(telling.MARKERS, raw).markers
+        assert [(p.x, p.y, p.z) for p in marker.points][:2] == [(10, 1, 2), (13, 4, 5)]
+
+
+class TestSettings:
+    def read(self, tmp_path: Path, text: str) -> Any:
+        path = tmp_path / "r.toml"
+        path.write_text(f'[store]\npath = "ledger.db"\n{text}')
+        return load_settings(path).config.ros
+
+    def test_defaults(self, tmp_path: Path) -> None:
+        ros = self.read(tmp_path, "[ros]\n")
+        assert (ros.cloud, ros.odometry, ros.map, ros.zenoh.domain) == (
+            "points",
+            "odom",
+            "~/map",
+            0,
+        )
+
+    @pytest.mark.parametrize(
+        ("text", "said"),
+        [
+            ('[ros]\ncloud = "bad name"', "cloud = 'bad name'"),
+            ('[ros]\ncloud = ""', "this or map_data is wanted"),
+            ('[ros]\ntf = ""', "tf = ''"),
+            ("[ros]\nvoxel = 0.0", "voxel = 0.0"),
+            ("[ros]\npublish_period = 0", "publish_period"),
+            ("[ros.zenoh]\ndomain = 300", "0 to 232"),
+            ('[ros.zenoh]\nnamespace = "robot1"', "namespace"),
+            ('[ros.zenoh]\nconnect = ["localhost"]', "tcp/localhost:7447"),
+            ("[ros]\nclouds = 1", "clouds"),
+            ('[ros]\n[source]\npath = "a.bag"', "one robot has one SLAM"),
+        ],
+    )
+    def test_what_is_wrong_is_named(self, tmp_path: Path, text: str, said: str) -> None:
+        with pytest.raises(ConfigError) as error:
+            self.read(tmp_path, text)
+        assert said in str(error.value) and str(tmp_path) in str(error.value)
