@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -20,6 +22,7 @@ from robots import Robot, agreed, until
 
 WHY_NOT = ros1.missing()
 needs_ros = pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT)
+EXAMPLES = Path(__file__).parents[1] / "examples" / "ros"
 ROS = "[ros]\nvoxel = 0.02\nmax_features = 5000\npublish_period = 0.2\npatience = 60.0\n"
 
 
@@ -141,11 +144,40 @@ def test_parameters_replace_what_the_file_says_and_wrong_ones_are_named(tmp_path
         with ended(node), Listener(port, "/a/dagmap/map") as listener:
             until(lambda: listener.last("/a/dagmap/map"), "an empty map")
             assert "/lidar/points" in _subscriptions(port)
-        for wrong, said in (("_voxle:=1", "voxle"), ("_patience:=100", "0.0 to 60.0 is wanted")):
-            node = start_node(port, a, wrong)
+        wrong = {"b": ("_voxle:=1", "voxle"), "c": ("_patience:=100", "0.0 to 60.0 is wanted")}
+        for name, (parameter, said) in wrong.items():  # a master keeps parameters by node
+            robot = Robot(None, tmp_path, name, more=ROS)  # type: ignore[arg-type]
+            node = start_node(port, robot, parameter)
             with ended(node):
                 assert node.wait(60) == 2
-            assert said in a.log and "Traceback" not in a.log
+            assert said in robot.log and robot.log.count("\n") == 1
+
+
+@needs_ros
+def test_the_launch_file_starts_three_robots(tmp_path: Path) -> None:
+    network = "[network]\nscouting = false\n"  # the robots need not meet here
+    for name in ("robot1", "robot2", "robot3"):
+        text = (EXAMPLES / f"{name}.toml").read_text()
+        (tmp_path / f"{name}.toml").write_text(text + network)
+    code = "from dagmap.cli.ros import ros1; ros1()"
+    path = ros1.environment(0)["PYTHONPATH"]
+    run = f"PYTHONPATH='{path}' exec {sys.executable} -c '{code}' \"$@\""
+    (tmp_path / "node").write_text(f"#!/bin/sh\n{run}\n")
+    (tmp_path / "node").chmod(0o755)
+    with ros1.roscore() as port:
+        env = {**ros1.environment(port), "ROS_PACKAGE_PATH": str(EXAMPLES), "PYTHONPATH": ""}
+        env |= {"DAGMAP_ROS1": str(tmp_path / "node")}
+        argv = [str(shutil.which("roslaunch")), "dagmap", "three_robots.launch"]
+        with (tmp_path / "log").open("w") as log:
+            launch = subprocess.Popen(
+                [*argv, f"files:={tmp_path}"], env=env, stdout=log, stderr=log, text=True
+            )
+        maps = [f"/robot{i}/dagmap/map" for i in (1, 2, 3)]
+        with ended(launch), Listener(port, *maps) as listener:
+            for topic in maps:
+                until(lambda topic=topic: listener.last(topic), f"a map on {topic}")
+            launch.send_signal(signal.SIGINT)  # as Ctrl-C: roslaunch ends its nodes
+            launch.wait(60)
 
 
 def _subscriptions(port: int) -> set[str]:

@@ -156,7 +156,7 @@ def test_the_graph_of_ros_shows_the_node_with_its_topics(
     with running(a):
         a.start()
         ros.wait_for_listener("/r1/points")
-        (listener,) = ros.endpoints("/r1/points")
+        (listener,) = until(lambda: ros.endpoints("/r1/points"), "the node")
         assert (listener.node_name, listener.topic_type) == ("dagmap", MAP)
         assert listener.node_namespace.strip("/") == "r1"
         (teller,) = until(lambda: ros.endpoints("/r1/dagmap/map", publishers=True), "a publisher")

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import random
+import re
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +14,10 @@ import pytest
 
 from bags import Make, Message, pose_at, room
 from dagmap import Agent, Config, Cycle, Identity
+from dagmap.io.log import Log
+from dagmap.io.queues import Inbox
 from dagmap.io.ros import telling
+from dagmap.io.ros.bridge import Bridge, _Heard
 from dagmap.io.ros.config import RosConfig
 from dagmap.io.ros.feed import Feed, wanted
 from dagmap.io.ros.types import Types
@@ -20,6 +27,7 @@ from dagmap.io.sources._ros import Unusable, cloud_arrays, transforms
 from dagmap.model import ConfigError
 from test_rtabmap_msgs import data, drift, graph, moved, node
 
+DOCS = Path(__file__).parents[1] / "docs"
 MAKE = Make(ros2=True)
 ROLES = {"/points": "cloud", "/odom": "odometry", "/tf": "tf", "/tf_static": "tf_static"}
 
@@ -192,6 +200,49 @@ class TestTelling:
         assert [(p.x, p.y, p.z) for p in marker.points][:2] == [(10, 1, 2), (13, 4, 5)]
 
 
+class Recorder:
+    """A link that nobody is at the other end of."""
+
+    ros2 = True
+
+    def __init__(self) -> None:
+        self.takes: dict[str, Callable[[bytes, str, str], None]] = {}
+
+    def subscribe(self, name: str, kind: str, quality: str, take: Any) -> None:
+        self.takes[name] = take
+
+    def advertise(self, name: str, kind: str, still: bool) -> Callable[[bytes], None]:
+        return lambda data: None
+
+    def close(self) -> None:
+        """There is nothing to close."""
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("mapped", [False, True])
+def test_mutated_messages_never_end_the_bridge(seed: int, mapped: bool) -> None:
+    """Whatever the bytes, they are cycles or counted; the bridge goes on, and is not slow."""
+    rng, types = random.Random(seed), Types(True)
+    if mapped:
+        said = data(1.0, [node(1, 1.0, np.eye(4), np.ones((5, 3)))], {1: np.eye(4)})
+        messages = [("map_data", *said[1:])]
+    else:
+        few = MAKE.cloud(1.05, room()[:20])
+        all_of = (few, MAKE.odometry(1.0), MAKE.mount())
+        messages = [(ROLES[m[0]], *m[1:]) for m in all_of]
+    config = RosConfig(map_data="mapData") if mapped else RosConfig()
+    bridge = Bridge(config, Recorder(), Inbox(1 << 20, 1 << 20), Log(sys.stderr, "error"))
+    for i in range(400):
+        role, kind, _, message = rng.choice(messages)
+        raw = bytearray(types.encode(kind, message))
+        for _ in range(rng.randint(1, 8)):
+            raw[rng.randrange(len(raw))] = rng.choice((0, 1, 0x7F, 0x80, 0xFF, rng.randrange(256)))
+        if rng.random() < 0.3:
+            del raw[rng.randrange(len(raw)) :]
+        for cycle in bridge._decoded(_Heard(role, kind, "", bytes(raw)), float(i)):
+            assert np.isfinite(np.asarray(cycle.points)).all()
+
+
 class TestSettings:
     def read(self, tmp_path: Path, text: str) -> Any:
         path = tmp_path / "r.toml"
@@ -206,6 +257,22 @@ class TestSettings:
             "~/map",
             0,
         )
+
+    def test_the_documented_table_holds_the_defaults(self, tmp_path: Path) -> None:
+        """The file in docs/ros.md shows every key, each with its default."""
+        text = (DOCS / "ros.md").read_text()
+        block = re.search(r"```toml\n(.*?)```", text, re.S)
+        assert block is not None
+        ros = self.read(tmp_path, block[1])
+        assert ros == RosConfig()
+        for key in (*ros.__struct_fields__, *ros.zenoh.__struct_fields__):
+            assert re.search(rf"^(# |\[ros\.)?{key}\b", block[1], re.M), key
+
+    @pytest.mark.parametrize("name", ["robot1", "robot2", "robot3"])
+    def test_the_examples(self, name: str) -> None:
+        settings = load_settings(DOCS.parent / "examples" / "ros" / f"{name}.toml")
+        assert settings.config.name == name and settings.config.ros is not None
+        assert settings.config.ros.zenoh.namespace == f"/{name}"
 
     @pytest.mark.parametrize(
         ("text", "said"),
