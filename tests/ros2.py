@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import socket
 import threading
 from collections.abc import Iterator
@@ -12,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import zenoh
+
+os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")  # it could fetch types by git: it need not
 import zenoh_ros2_sdk as sdk
 
 from bags import Make, Message

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
+import zenoh_ros2_sdk as sdk
 
 from bags import Make, room
 from dagmap.io.ros.rmw import Node, Qos, Topic, attachment, gid
@@ -17,7 +18,6 @@ from dagmap.io.sources._ros import cloud_arrays
 from robots import Nursery, Robot, agreed, running, until
 from ros2 import DOMAIN, KINDS, Ros2, router, write_definitions
 
-sdk = pytest.importorskip("zenoh_ros2_sdk")
 MAP, GRAPH, DIAGNOSTICS = (
     "sensor_msgs/msg/PointCloud2",
     "visualization_msgs/msg/MarkerArray",

@@ -95,6 +95,13 @@ class TestPoses:
         give(feed, MAKE.odometry(1.0), MAKE.tf(1.0, "fleet", "odom", moved(9.0), False))
         assert feed.map_frame() == ("odom", pytest.approx(np.eye(4)))
 
+    def test_a_map_frame_that_is_not_there_is_told_of(self) -> None:
+        feed = Feed(RosConfig(map_frame="map"))
+        give(feed, MAKE.mount(), MAKE.odometry(1.0))
+        assert feed.map_frame() is None and feed.lost_frame == "odom"
+        give(feed, MAKE.tf(1.0, "map", "odom", moved(3.0), False))
+        assert feed.map_frame() is not None and feed.lost_frame == ""
+
 
 class TestBounds:
     def test_clouds_that_wait(self) -> None:
@@ -192,12 +199,41 @@ class TestTelling:
         (found,) = transforms(types.decode(telling.TRANSFORMS, raw))
         assert found[:3] == ("fleet", "map", 1.0) and np.allclose(found[3], pose, atol=1e-8)
 
+    def test_a_transform_may_lead_to_the_other_end_of_the_world(self) -> None:
+        types, pose = Types(True), moved(-5.4e6, 1.0)
+        raw = telling.transform_message(types, pose, "fleet", "utm", 1.0)
+        ((_, _, _, found),) = transforms(types.decode(telling.TRANSFORMS, raw))
+        assert np.allclose(found, pose)
+
     def test_the_graph_in_the_robots_map_frame(self) -> None:
         types = Types(True)
         edges = np.arange(12.0).reshape(2, 2, 3)
         raw = telling.graph_message(types, edges, moved(10.0), 1.0, "map")
         (marker,) = types.decode(telling.MARKERS, raw).markers
         assert [(p.x, p.y, p.z) for p in marker.points][:2] == [(10, 1, 2), (13, 4, 5)]
+
+
+def test_what_ros_1_sends_along_is_learnt() -> None:
+    """rtabmap_msgs of ROS 1 calls fields otherwise: their definition comes with the messages."""
+    kind = "rtabmap_msgs/msg/MapGraph"
+    definition = "\n".join(
+        [
+            "Header header", "geometry_msgs/Transform mapToOdom", "int32[] posesId",
+            "geometry_msgs/Pose[] poses", "Link[] links", "=" * 80, "MSG: rtabmap_msgs/Link",
+            "int32 fromId", "int32 toId", "int32 type", "geometry_msgs/Transform transform",
+            "float64[36] information",
+        ]
+    )  # fmt: skip
+    theirs, ours = Types(False), Types(False)
+    theirs.learn(kind, definition)
+    poses = [theirs.make("geometry_msgs/msg/Pose")]
+    raw = theirs.encode(kind, theirs.make(kind, posesId=np.ones(1, np.int32), poses=poses))
+    with pytest.raises(Unusable, match="cannot be decoded as rtabmap_msgs/msg/MapGraph"):
+        ours.decode(kind, raw)
+    ours.learn(kind, definition)
+    assert ours.decode(kind, raw).posesId.tolist() == [1]
+    with pytest.raises(Unusable, match="definition of x_msgs/msg/Y cannot be read"):
+        ours.learn("x_msgs/msg/Y", "int32[ x")
 
 
 class Recorder:

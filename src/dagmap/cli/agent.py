@@ -115,9 +115,12 @@ class AgentCommand:
     ) -> Bridge:
         """From and to the robot's ROS, as long as the stack."""
         link = ZenohLink(config.zenoh) if self.link is None else self.link()
-        stack.callback(link.close)
-        bridge = stack.enter_context(Bridge(config, link, runtime.inbox, log, session, ready))
-        bridge.start()
+        try:
+            bridge = Bridge(config, link, runtime.inbox, log, session, ready)
+        except BaseException:
+            link.close()
+            raise
+        stack.enter_context(bridge).start()
         return bridge
 
     def _open_source(self, settings: Settings) -> Source | None:

@@ -195,18 +195,19 @@ class Bridge(Closing):
     def _tell_map(self) -> None:
         picture, types, config, stamp = self._picture, self._types, self._config, self._stamp
         assert picture is not None
-        fleet = config.fleet_frame or "fleet"
-        most = config.max_nodes
-        self._send["map"](telling.map_message(types, picture.world, stamp, fleet, most))
+        if picture.placed:
+            fleet = config.fleet_frame or "fleet"
+            raw = telling.map_message(types, picture.world, stamp, fleet, config.max_nodes)
+            self._send["map"](raw)
         here = self._feed.map_frame()
         if "graph" in self._send and here is not None:
             name, pose = here
-            message = telling.graph_message(types, picture.edges, inverse(pose), stamp, name)
-            self._send["graph"](message)
+            raw = telling.graph_message(types, picture.edges, inverse(pose), stamp, name)
+            self._send["graph"](raw)
         if "diagnostics" in self._send:
             feed, problem = self._said()
-            message = telling.diagnostics_message(types, picture, feed, problem, stamp)
-            self._send["diagnostics"](message)
+            raw = telling.diagnostics_message(types, picture, feed, problem, stamp)
+            self._send["diagnostics"](raw)
 
     def _tell_frame(self) -> None:
         """fleet -> map: the pose of the robot's map frame in the fleet's frame."""
@@ -237,4 +238,6 @@ class Bridge(Closing):
         if problem is None and not np.isfinite(feed.newest):
             heard = ", ".join(topic.name for topic in wanted(self._config))
             problem = f"nothing was heard yet on {heard}"
+        elif problem is None and feed.lost_frame:
+            problem = f"no tf leads from {feed.lost_frame} to map_frame = {self._config.map_frame}"
         return said, problem

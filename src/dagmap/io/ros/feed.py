@@ -111,6 +111,11 @@ class Feed:
         pose = tree.pose(name, here, at)
         return None if pose is None else (name, inverse(pose))
 
+    @property
+    def lost_frame(self) -> str:
+        """The frame of the poses, where no tf leads from it to the one that is to be told of."""
+        return "" if self.map_frame() is not None else self._pose_frame
+
     def _follow(self, role: str, message: Any) -> list[Cycle]:
         follower, self.problem = self._follower, None
         found = follower.data(message) if role == "map_data" else follower.graph(message)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...model import QUATERNION_ONE, Floats, State, quantise_pose
+from ...model import FLEET_FRAME, QUATERNION_ONE, Floats, State, quantise_pose
 from ...worldmap import WorldMap
 from ..runtime import Runtime
 from .types import Types
@@ -49,6 +49,11 @@ class Picture:
     name: str
     author: str
     said: Mapping[str, object]
+
+    @property
+    def placed(self) -> bool:
+        """Whether the map is in the fleet's frame; else it is in one that nobody shares."""
+        return self.frame is not None or self.world.origin == FLEET_FRAME
 
 
 def take_picture(runtime: Runtime, edges: int) -> Picture:
@@ -153,7 +158,7 @@ def diagnostics_message(
     types: Types, picture: Picture, feed: Mapping[str, object], problem: str | None, stamp: float
 ) -> bytes:
     """A DiagnosticArray with one status. feed: what there is to say of the robot's own topics."""
-    if problem is None and picture.frame is None:
+    if problem is None and not picture.placed:
         problem = "not placed in the fleet's frame yet"
     values = [
         types.make("diagnostic_msgs/msg/KeyValue", key=key, value=str(value))
@@ -188,5 +193,7 @@ def transform_message(types: Types, pose: Floats, parent: str, child: str, stamp
 
 
 def _turn(types: Types, pose: Floats) -> Any:
-    w, x, y, z = (quantise_pose(pose)[:4] / QUATERNION_ONE).tolist()
+    only = np.eye(4)  # tf may go further than a map does: UTM coordinates are millions of metres
+    only[:3, :3] = pose[:3, :3]
+    w, x, y, z = (quantise_pose(only)[:4] / QUATERNION_ONE).tolist()
     return types.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)

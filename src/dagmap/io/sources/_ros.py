@@ -90,7 +90,8 @@ def cloud_arrays(message: Any) -> tuple[Floats, Uint8s | None]:
     kind = np.dtype({"names": wanted, "formats": kinds, "offsets": places, "itemsize": step})
     data = data[: row * height].reshape(height, row)[:, : step * width]
     rows = np.frombuffer(data.tobytes(), kind)
-    points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    with np.errstate(invalid="ignore"):  # signalling NaNs stay what they are
+        points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
     color = next((name for name in ("rgb", "rgba") if name in wanted), None)
     if color is None or rows.dtype[color].itemsize != 4:
         return points, None
