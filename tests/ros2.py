@@ -28,6 +28,7 @@ KINDS = (
     "visualization_msgs/msg/MarkerArray",
     "diagnostic_msgs/msg/DiagnosticArray",
     "rtabmap_msgs/msg/MapData",
+    "rtabmap_msgs/msg/MapGraph",
 )
 
 
@@ -85,19 +86,21 @@ class Ros2:
     def publish(self, namespace: str, message: Message) -> None:
         """A message as `bags.Make` makes it; relative topics go below the namespace."""
         topic, kind, _, said = message
-        name = topic if topic.startswith("/tf") else namespace + topic
+        name = topic if topic[:3] == "/tf" else namespace + topic
         if name not in self._publishers:
             self._publishers[name] = self._publisher(name, kind)
         fields = {field.name: getattr(said, field.name) for field in dataclasses.fields(said)}
         self._publishers[name].publish(**{k: v for k, v in fields.items() if k[:2] != "__"})
 
     def _publisher(self, name: str, kind: str) -> Any:
-        """One that waits where the network is busy: by default what is too much is dropped."""
+        """One that loses nothing: by default what is too much is dropped, and so is what is said
+        before it is known here that somebody listens."""
         made = sdk.ROS2Publisher(name, kind, domain_id=DOMAIN)
         made.pub.undeclare()
         control = zenoh.CongestionControl.BLOCK
         made.pub = self.session.session.declare_publisher(made.keyexpr, congestion_control=control)
         self._open.append(made)
+        until(lambda: made.pub.matching_status.matching, f"somebody to hear {name}")
         return made
 
     def listen(self, topic: str, kind: str, qos: str | None = None) -> None:

@@ -17,6 +17,7 @@ from dagmap.io.ros.types import Types
 from dagmap.io.sources._ros import cloud_arrays
 from robots import Nursery, Robot, agreed, running, until
 from ros2 import DOMAIN, KINDS, Ros2, router, write_definitions
+from test_rtabmap_msgs import drift, mapping
 
 MAP, GRAPH, DIAGNOSTICS = (
     "sensor_msgs/msg/PointCloud2",
@@ -209,6 +210,34 @@ def test_bad_messages_are_told_of_and_stop_nothing(
 
         until(lambda: refused() == "6", "diagnostics to count")
         assert 'event="message refused"' in a.log and "topic=cloud" in a.log
+        assert a.stop() == 0
+
+
+def test_rtabmap_feeds_a_robot_and_its_closures_move_the_map(
+    tmp_path: Path, nursery: Nursery, ros: Ros2
+) -> None:
+    topics = {"map_data": "/rtabmap/mapData", "map_graph": "/rtabmap/mapGraph"}
+    a = Robot(nursery, tmp_path, "a", more=table(ros.port, "/", **topics))
+    with running(a):
+        a.start()
+        ros.wait_for_listener(*topics.values())
+        ros.listen("/dagmap/map", MAP)
+        ros.listen("/tf", "tf2_msgs/msg/TFMessage")
+        for message in mapping():
+            ros.publish("", message)
+
+        def straight() -> bool:
+            message = ros.last("/dagmap/map")
+            if message is None or message.width != 200:
+                return False
+            places = points_of(message) - drift(1)[:3, 3]
+            walls = np.array([[-4, 4], [-3, 3], [-1, 2]])
+            return bool(np.abs(places[:, :, None] - walls).min(axis=(1, 2)).max() < 0.003)
+
+        until(lambda: a.answer()["cycles"] == 5, "four nodes and the closure")
+        until(straight, "the map that the closure straightens")
+        until(lambda: ros.last("/tf"), "a transform")
+        assert ros.last("/tf").transforms[0].child_frame_id == "map"
         assert a.stop() == 0
 
 

@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,10 +18,11 @@ from dagmap import Agent, Config, Cycle, Identity
 from dagmap.io.log import Log
 from dagmap.io.queues import Inbox
 from dagmap.io.ros import telling
-from dagmap.io.ros.bridge import Bridge, _Heard
+from dagmap.io.ros.bridge import Bridge, _Backlog, _Heard
 from dagmap.io.ros.config import RosConfig
 from dagmap.io.ros.feed import Feed, wanted
 from dagmap.io.ros.types import Types
+from dagmap.io.runtime import Counts
 from dagmap.io.settings import load_settings
 from dagmap.io.sources._poses import inverse
 from dagmap.io.sources._ros import Unusable, cloud_arrays, transforms
@@ -211,6 +213,45 @@ class TestTelling:
         raw = telling.graph_message(types, edges, moved(10.0), 1.0, "map")
         (marker,) = types.decode(telling.MARKERS, raw).markers
         assert [(p.x, p.y, p.z) for p in marker.points][:2] == [(10, 1, 2), (13, 4, 5)]
+
+
+def picture_of(agent: Agent) -> telling.Picture:
+    network = SimpleNamespace(here=frozenset(), waiting_bytes=0)
+    runtime: Any = SimpleNamespace(agent=agent, counts=Counts(), network=network)
+    return telling.take_picture(runtime, edges=100)
+
+
+def test_diagnostics_say_how_it_stands(agent: Agent) -> None:
+    types, picture = Types(True), picture_of(agent)
+    assert picture.placed and picture.edges.shape == (100, 2, 3)
+
+    def status(picture: telling.Picture, problem: str | None) -> Any:
+        raw = telling.diagnostics_message(types, picture, {"clouds waiting": 3}, problem, 1.0)
+        return types.decode(telling.DIAGNOSTICS, raw).status[0]
+
+    good = status(picture, None)
+    assert (good.level, good.name, good.message) == (0, "dagmap: r1", "mapping")
+    values = {each.key: each.value for each in good.values}
+    assert values["map nodes"] == str(len(agent.map)) and values["clouds waiting"] == "3"
+    assert values["digest"] == agent.digest().hex()
+    bad = status(picture, "nothing was heard")
+    assert (bad.level, bad.message) == (1, "nothing was heard")
+    lost = Agent(Identity.from_seed(bytes(32)), Config(start_pose=None))
+    lost.observe(Cycle(1.0, np.eye(4), np.ones((9, 3))), 0.0)
+    assert not picture_of(lost).placed
+    assert status(picture_of(lost), None).message == "not placed in the fleet's frame yet"
+
+
+def test_of_messages_that_wait_the_oldest_are_dropped() -> None:
+    backlog = _Backlog(10_000)
+    for i in range(20):
+        backlog.put(_Heard("cloud", "", "", bytes([i]) * 1000))
+    assert backlog.dropped == 12
+    item = backlog.take(0.0)
+    assert item is not None and item.raw[0] == 12
+    for _ in range(7):
+        assert backlog.take(0.0) is not None
+    assert backlog.take(0.0) is None
 
 
 def test_what_ros_1_sends_along_is_learnt() -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.typesys import get_types_from_msg
 
 from bags import Make, Message, pose_at, room, write_bag
 from dagmap import Agent, Config, Identity
@@ -21,6 +22,7 @@ from dagmap.io.sources import Options, describe_source, open_source
 from dagmap.io.sources._poses import inverse
 from dagmap.io.sources._ros import Unusable
 from dagmap.io.sources._rtabmap_graph import GraphFollower
+from dagmap.io.sources._rtabmap_msgs import _DEFINITIONS
 from dagmap.model import RecordingError
 from test_replay import dagmap
 
@@ -139,6 +141,39 @@ def test_a_bag_that_brings_no_definitions_is_read(tmp_path: Path) -> None:
     with closing(sqlite3.connect(path)) as database, database:
         database.execute("DELETE FROM message_definitions")  # as Humble records
     assert len(open_source(path)) == 5
+
+
+def test_a_bag_of_ros_1_calls_fields_otherwise(tmp_path: Path) -> None:
+    names = {"map_to_odom": "mapToOdom", "poses_id": "posesId", "from_id": "fromId"}
+    make = Make(ros2=False)
+    for name, text in _DEFINITIONS.items():
+        for new, old in {**names, "to_id": "toId"}.items():
+            text = text.replace(new, old)
+        kind = f"rtabmap_msgs/msg/{name}"
+        make.types.register(get_types_from_msg(text, kind))
+    old = Types(ros2=False)
+    old._store = make.types
+
+    def like(kind: str, value: Any) -> Any:
+        """The same message with the fields of ROS 1."""
+        _, fields = make.types.fielddefs[kind]
+        given = {}
+        for field, (how, of) in fields:
+            new = next((k for k, v in names.items() if v == field), field)
+            new = "to_id" if field == "toId" else new
+            if hasattr(value, new):
+                found = getattr(value, new)
+                if int(how) == 2:
+                    found = like(of, found)
+                elif int(how) == 4 and int(of[0][0]) == 2:
+                    found = [like(of[0][1], each) for each in found]
+                given[field] = found
+        return old.make(kind, **given)
+
+    messages = [(topic, kind, stamp, like(kind, said)) for topic, kind, stamp, said in mapping()]
+    found = list(open_source(write_bag(tmp_path / "walk.bag", make, messages)))
+    assert len(found) == 5 and found[4].moved is not None
+    assert np.allclose(found[3].pose, drift(4) @ pose_at(4.0), atol=1e-6)
 
 
 def test_inspect_says_what_is_used(tmp_path: Path) -> None:
