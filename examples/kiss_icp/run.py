@@ -3,8 +3,8 @@
     pip install 'dagmap[lidar]'
     python examples/kiss_icp/run.py
 
-The scans are made here: a hall with pillars, and a LiDAR whose beams do not repeat. With your own LiDAR, `scan` is your driver,
-`send` is your radio, and each robot is a process of its own.
+The scans are made here: a hall with pillars, and a LiDAR whose beams do not repeat. With
+your own LiDAR, `scan` is your driver, `send` is your radio, and each robot is a process of its own.
 """
 
 from __future__ import annotations
