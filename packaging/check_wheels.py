@@ -5,7 +5,8 @@
     python packaging/check_wheels.py --extra fleet --python 3.11 --list
 
 Nothing is installed. The index is the one that pip is configured for. pip judges the conditions of
-requirements by the interpreter that runs it, so those of DAGmap's own are all taken as true.
+requirements by the interpreter that runs it, so of DAGmap's own only those of the
+machine count here.
 """
 
 from __future__ import annotations
@@ -25,13 +26,15 @@ PYTHONS = ("3.10", "3.11", "3.12", "3.13")
 GLIBC = 35  # of 2.35, Ubuntu 22.04: what wheels may ask for at most
 
 
-def requirements(extras: list[str]) -> list[str]:
-    """The base and these extras, without conditions."""
+def requirements(extras: list[str], machine: str) -> list[str]:
+    """The base and these extras, less what is not meant for a machine."""
     project = msgspec.toml.decode(PROJECT.read_bytes())["project"]
     table: dict[str, list[str]] = project["optional-dependencies"]
     found, waiting = [], [*project["dependencies"], *(r for e in extras for r in table[e])]
     while waiting:
-        one = waiting.pop(0).partition(";")[0].strip()
+        one, _, condition = (part.strip() for part in waiting.pop(0).partition(";"))
+        if condition == f"platform_machine != '{machine}'":
+            continue
         own = re.fullmatch(r"dagmap\[([\w,]+)\]", one)
         waiting += [r for e in own[1].split(",") for r in table[e]] if own else []
         found += [] if own or one in found else [one]
@@ -71,8 +74,9 @@ def main() -> None:
     parser.add_argument("--machine", action="append", choices=("aarch64", "x86_64"))
     parser.add_argument("--list", action="store_true", help="name the wheels")
     options = parser.parse_args()
-    names, lacking = requirements(options.extra), 0
+    lacking = 0
     for machine in options.machine or ["aarch64"]:
+        names = requirements(options.extra, machine)
         for python in options.python or PYTHONS:
             try:
                 wheels = resolve(names, python, machine)
