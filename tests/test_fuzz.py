@@ -34,6 +34,7 @@ from dagmap.payload import Kind, encode_payload
 from dagmap.wire import Reader, Refusal
 from grammar import flipper, rest, tree
 from targets import _wire, tum
+from targets._folders import files_of
 
 ROOT = Path(__file__).parents[1]
 NAMES = targets.names()
@@ -141,7 +142,7 @@ def far_pose() -> bytes:
 
 
 def folder(**changed: bytes) -> bytes:
-    files = dict(tum._read(next(iter(tum.seeds()))))
+    files = dict(files_of(next(iter(tum.seeds()))))
     new = {name.replace("_", ".").encode(): data for name, data in changed.items()}
     return tum.pack((files | new).items())
 

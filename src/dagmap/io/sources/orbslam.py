@@ -92,18 +92,22 @@ class OrbSlamMap:
     def _read(self, file: Path) -> tuple[Floats, Uint8s | None]:
         if file.suffix.lower() in READERS:
             return READERS[file.suffix.lower()](file)
-        rows: list[tuple[float, ...]] = []
+        rows: list[list[float]] = []
         for number, words in read_rows(file):
             try:
-                x, y, z = (float(word) for word in words[:3])
+                rows.append(_place(words))
             except ValueError:
-                if not rows and not self.skips.count and all(word.isalpha() for word in words):
-                    continue  # the names of the columns
-                where = f"{file}, line {number}"
-                self.skips.note(RecordingError(f"{where}: `x y z` is wanted, not {words[:3]}"))
-                continue
-            rows.append((x, y, z))
+                names = not rows and all(word.isalpha() for word in words)  # of the columns
+                if not names:
+                    where = f"{file}, line {number}"
+                    self.skips.note(RecordingError(f"{where}: `x y z` is wanted, not {words[:3]}"))
         return np.array(rows, np.float64).reshape(-1, 3), None
+
+
+def _place(words: list[str]) -> list[float]:
+    """Raises ValueError where they do not begin with three numbers."""
+    x, y, z = (float(word) for word in words[:3])
+    return [x, y, z]
 
 
 def _files(path: Path) -> tuple[Path, Path] | None:

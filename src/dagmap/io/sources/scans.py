@@ -94,7 +94,7 @@ class ScanFolder:
                 points, colors = READERS[cloud.suffix.lower()](cloud)
                 pose = self._poses[i] if self._poses is not None else np.eye(4)
                 if odometry is not None:
-                    pose = odometry.register(points)
+                    pose = odometry.register(points, cloud)
                 points, colors = thinned(points, colors, self._options)
                 cycle = checked(Cycle(stamp, pose, points, colors=colors), cloud)
             except RecordingError as error:
