@@ -147,7 +147,7 @@ def _clouds(path: Path) -> list[Path]:
         place = path / folder
         if place.is_dir() and not (folder == "." and (path / "rgb").is_dir()):  # a TUM folder
             for suffix in _SUFFIXES:
-                found = [file for file in place.glob(f"*{suffix}") if file.is_file()]
+                found = [file for file in place.glob(f"[!.]*{suffix}") if file.is_file()]
                 if found:
                     return sorted(found, key=_by_number)
     return []
