@@ -258,7 +258,7 @@ def _by_planes(points: Points, reach: float) -> Noise | None:
     if found is None:
         return None
     facing, ranges = found.facing, points.reach[found.rows]
-    across = _across(found.off, found.cosine)
+    across = _across(found.off[found.flat], found.cosine[found.flat])
     return _noise(found.along[facing], ranges[facing], across, "planes")
 
 
@@ -273,17 +273,24 @@ class Patches(NamedTuple):
     """Points, a row each, against the plane through their neighbours.
 
     rows: (M,) of `Points`. off: (M,) m from the plane, as many as one observation is off. cosine:
-    (M,) between ray and normal.
+    (M,) between ray and normal. rough: (M,) how far the neighbours are
+    off their plane, over the median of patches at that range.
     """
 
     rows: Int64s
     off: Floats
     cosine: Floats
+    rough: Floats
 
     @property
     def facing(self) -> Bools:
-        """(M,) whether a patch shows noise along the ray."""
-        return np.asarray(self.cosine > _FACING)
+        """(M,) whether a patch shows noise along the ray: it faces the sensor, and is no corner."""
+        return np.asarray((self.cosine > _FACING) & self.flat)
+
+    @property
+    def flat(self) -> Bools:
+        """(M,) whether a patch is no rougher than most. The point itself has no part in that."""
+        return np.asarray(self.rough <= 1.0)
 
     @property
     def along(self) -> Floats:
@@ -303,7 +310,9 @@ def patches(points: Points, key: Int64s, reach: float) -> Patches | None:
         whole = distance[:, -1] <= _WIDEST * reach
         if whole.sum() < _PAIRS:
             break
-        found = Patches(rows[whole], *_against_planes(points, rows[whole], index[whole]))
+        off, cosine, rough = _against_planes(points, rows[whole], index[whole])
+        rough /= _usual(rough, points.reach[rows[whole]])
+        found = Patches(rows[whole], off, cosine, rough)
         if found.facing.sum() < _PAIRS:
             break
         best, width = found, float(np.median(distance[whole, -1]))
@@ -312,7 +321,15 @@ def patches(points: Points, key: Int64s, reach: float) -> Patches | None:
     return best
 
 
-def _against_planes(points: Points, rows: Int64s, index: Int64s) -> tuple[Floats, Floats]:
+def _usual(rough: Floats, reach: Floats) -> Floats:
+    """(M,) m, the median over patches at about the range of each."""
+    edges = np.unique(np.percentile(reach, np.linspace(0, 100, 2 * _BINS + 1)))
+    bins = np.searchsorted(edges[1:-1], reach)
+    medians = [np.median(rough[bins == b]) if (bins == b).any() else 1.0 for b in range(len(edges))]
+    return np.asarray(np.maximum(np.array(medians)[bins], 1e-9))
+
+
+def _against_planes(points: Points, rows: Int64s, index: Int64s) -> tuple[Floats, ...]:
     patch = points.place[index]
     centre = patch.mean(axis=1)
     spread = patch - centre[:, None]
@@ -326,7 +343,8 @@ def _against_planes(points: Points, rows: Int64s, index: Int64s) -> tuple[Floats
     sideways = np.einsum("ni,nij->nj", away, axes[:, :, 1:])
     leverage = (sideways**2 / np.maximum(values[:, 1:], 1e-12)).sum(axis=1)
     cosine = np.abs((points.ray[rows] * normal).sum(axis=1))
-    return off / np.sqrt(1 + 1 / k + leverage), cosine
+    rough = np.sqrt(np.maximum(values[:, 0], 0.0) / k)
+    return off / np.sqrt(1 + 1 / k + leverage), cosine, rough
 
 
 def _across(off: Floats, cosine: Floats) -> float | None:

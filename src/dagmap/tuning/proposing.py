@@ -101,8 +101,10 @@ def _delta(measured: Measured) -> Proposed:
 
 
 def _placing(measured: Measured) -> list[Proposed]:
-    value = _up(max(4 * measured.noise.along, 0.02), 0.01)
-    return [Proposed("placing.tolerance", value, "four times the noise at the median range")]
+    """How far apart two robots see one point: their frames may not fit exactly."""
+    sigma = max(measured.noise.along, measured.between_robots or 0.0)
+    value = min(_up(max(4 * sigma, 0.02), 0.01), 10.0)
+    return [Proposed("placing.tolerance", value, f"four times the noise, {1000 * sigma:.0f} mm")]
 
 
 def _rays(measured: Measured, delta: float) -> list[Proposed]:
