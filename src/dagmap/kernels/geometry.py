@@ -55,6 +55,13 @@ def apply_pose(pose: Int32s, points: Int32s, out: Int32s, inside: Bools) -> None
             inside[i] = False
 
 
+def carry(pose: Int32s, points: Int32s) -> tuple[Int32s, Bools]:
+    """Points (N, 3) mm through a pose, and which of them stay within range."""
+    out, inside = np.empty_like(points), np.ones(len(points), np.bool_)
+    apply_pose(pose, points, out, inside)
+    return out, inside
+
+
 def compose(outer: Int32s, inner: Int32s) -> Int32s:
     """The pose that applies `inner`, then `outer`; the translation saturates at +-2^29 mm."""
     return np.array(_composed(tuple(outer.tolist()), tuple(inner.tolist())), np.int32)
