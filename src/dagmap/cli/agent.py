@@ -128,7 +128,8 @@ class AgentCommand:
         if table is None:
             return None
         camera = None if table.camera is None else settings.at(table.camera)
-        return open_source(settings.at(table.path), table.options(camera))
+        poses = None if table.poses is None else settings.at(table.poses)
+        return open_source(settings.at(table.path), table.options(camera, poses))
 
     def _assemble(
         self, settings: Settings, log: Log, stack: ExitStack

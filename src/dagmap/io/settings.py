@@ -26,6 +26,7 @@ class SourceConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     path: str  # any recording that `dagmap inspect` knows
     max_features: int = 1000  # points that a frame of pictures gives at most
     camera: str | None = None  # a camera.json to use instead of the recording's own
+    poses: str | None = None  # a file of poses: TUM, or KITTI beside clouds
     max_depth: float | None = None  # m, points beyond are dropped
     topics: tuple[str, ...] = ()  # of a bag; what is not named is found by its type
     frame: str | None = None  # of a bag with tf: the frame that stands still
@@ -33,10 +34,11 @@ class SourceConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     voxel: float = 0.1  # m: of a cloud one point a voxel is kept
     keep_going: bool = False  # leave out what cannot be read
 
-    def options(self, camera: Path | None) -> Options:
+    def options(self, camera: Path | None, poses: Path | None = None) -> Options:
         """What the readers take. Raises ConfigError where one is out of its range."""
         return Options(
             camera=camera,
+            poses=poses,
             max_features=self.max_features,
             max_depth=self.max_depth,
             topics=self.topics,

@@ -93,7 +93,10 @@ class CloudBag:
                 continue
             try:
                 points, colors = self._bag.read(message, ros.cloud_arrays)
-                pose = odometry.register(points) if odometry else (self._poses or {})[number]
+                if odometry is None:
+                    pose = (self._poses or {})[number]
+                else:
+                    pose = odometry.register(points, self._bag.path)
                 points, colors = thinned(points, colors, self._options)
                 cycle = Cycle(self._stamps[number], pose, points, colors=colors)
                 yield checked(cycle, self._bag.path)

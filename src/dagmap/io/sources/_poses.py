@@ -82,6 +82,11 @@ class Trajectory:
         self._rows = {stamp: pose for stamp, pose in self._rows.items() if stamp >= before}
         self._stamps = None
 
+    def all(self) -> tuple[Floats, Floats]:
+        """Rising stamps (M,) and poses (M, 4, 4)."""
+        stamps = sorted(self._rows)
+        return np.array(stamps), np.array([self._rows[stamp] for stamp in stamps])
+
     def at(self, stamp: float) -> Floats | None:
         """(4, 4) interpolated; the nearest one within 20 ms where there is no pair; else None."""
         if not self._rows:
