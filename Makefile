@@ -6,6 +6,7 @@
 #   make test         make check, then the test suite
 #   make check        ruff, mypy, import-linter
 #   make bench        measure the speed (dagmap bench)
+#   make figures      the paper's figures and what was measured beside them, in out/figures; minutes
 #   make sweep        thousands of simulated missions with faults and liars, SEEDS=2000 for more, and
 #                     a real robot killed 200 times, KILLS=2000 for more
 #   make reliability  all figures and plots of docs/reliability.md; hours
@@ -38,7 +39,7 @@ OFFICE := examples/office/robot1 examples/office/robot2 examples/office/robot3
 # A sourced ROS workspace sets PYTHONPATH; its packages must not mix with those of the environments.
 unexport PYTHONPATH
 
-.PHONY: demo fleet test check bench sweep reliability fuzz docs lock clean clean-cache
+.PHONY: demo fleet test check bench figures sweep reliability fuzz docs lock clean clean-cache
 .DELETE_ON_ERROR:
 
 demo: $(DEMO)/.package
@@ -61,6 +62,9 @@ check: $(TEST)/.package
 
 bench: $(TEST)/.package
 	@$(TEST)/bin/dagmap bench
+
+figures: $(TEST)/.package
+	@$(TEST)/bin/python experiments/all.py --out out/figures
 
 sweep: $(TEST)/.package
 	@$(TEST)/bin/dagmap simulate $(SWEPT) --seeds $(SEEDS)
@@ -125,9 +129,9 @@ $(LOCK)/bin/uv: | $(LOCK)/bin/python
 
 # numba notices a change in a kernel's own file, not in one that it calls from another file.
 clean-cache:
-	find src bench fuzz tests $(wildcard $(DEMO)) \( -name '*.nbi' -o -name '*.nbc' \) -delete
+	find src bench experiments fuzz tests $(wildcard $(DEMO)) \( -name '*.nbi' -o -name '*.nbc' \) -delete
 
 clean: clean-cache
 	rm -rf $(DEMO) $(TEST) $(LOCK) out build dist .hypothesis .import_linter_cache .mypy_cache \
 	  .pytest_cache .ruff_cache .benchmarks
-	find src bench fuzz tests -name __pycache__ -prune -exec rm -rf {} +
+	find src bench experiments fuzz tests -name __pycache__ -prune -exec rm -rf {} +

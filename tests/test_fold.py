@@ -367,7 +367,7 @@ def test_somebody_who_walked_by_is_gone_and_what_was_seen_often_stays() -> None:
     """A dense patch of one cycle, in space that others then see through."""
     config = FoldConfig(delta=0.03, cell=0.1, max_ray=5.0)
     patch = [(1250 + (y * z) % 3, 50 + 31 * y, 50 + 31 * z) for y in range(5) for z in range(5)]
-    for cycles, state in ((1, State.REJECTED), (3, State.TENTATIVE)):
+    for cycles, state in ((1, State.REJECTED), (2, State.REJECTED), (3, State.TENTATIVE)):
         rays = RayEvidence(config.cell_mm, config.max_ray_mm)
         fold = make_fold(config)
         for k in range(cycles):

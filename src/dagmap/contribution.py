@@ -15,7 +15,7 @@ import numpy as np
 from .config import Config
 from .fold import Block
 from .kernels.columns import grown
-from .kernels.geometry import carry
+from .kernels.geometry import carry_segments
 from .model import AuthorId, Bools, FrameId, Int32s, Int64s
 from .payload import Anchor, Link, Sighting
 from .transaction import Transaction
@@ -137,7 +137,7 @@ class Contribution:
             alive[: len(gone)] &= ~gone
         self.xyz = np.zeros_like(position)
         origins = np.zeros((len(homes), 3), np.int32)
-        carry(poses, self.starts, position, self.xyz, origins, alive)
+        carry_segments(poses, self.starts, position, self.xyz, origins, alive)
         self.parts = []
         if component is not None:
             mask = None if bool(alive.all()) else alive

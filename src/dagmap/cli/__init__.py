@@ -116,6 +116,37 @@ def inspect(
 
 
 @app.command()
+def tune(
+    recordings: Annotated[
+        list[Path], typer.Argument(help="One per robot; those of one fleet share a frame.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="TOML file to write; default: the terminal.")
+    ] = None,
+    camera: Annotated[Path | None, typer.Option(help="camera.json to use.")] = None,
+    max_features: Annotated[int, typer.Option(help="Points a frame gives at most.")] = 1000,
+    max_depth: _MaxDepth = None,
+    topic: _Topic = None,
+    frame: _Frame = None,
+    same_frame: _SameFrame = False,
+    poses: _Poses = None,
+    voxel: _Voxel = 0.1,
+    keep_going: _KeepGoing = False,
+    force: Annotated[bool, typer.Option(help="Replace the file.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Propose parameters from what recordings show of resolution and noise, without truth."""
+    from ..io.sources import Options
+    from .tune import Tune
+
+    options = Options(
+        camera, max_features, max_depth, tuple(topic or ()), frame, same_frame, poses, voxel,
+        keep_going,
+    )  # fmt: skip
+    Tune(recordings, out, options, force, json).run()
+
+
+@app.command()
 def agent(
     config: Annotated[Path, typer.Argument(help="TOML file of this robot, see docs/fleet.md.")],
     speed: Annotated[float, typer.Option(help="Play the recording so many times as fast.")] = 1.0,

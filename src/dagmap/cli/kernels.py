@@ -62,7 +62,7 @@ def warm_fold() -> None:
     """Compile what folds features and walks their rays."""
     from ..config import FoldConfig
     from ..fold import Block, DefaultFold, RayEvidence
-    from ..kernels.geometry import apply_pose, carry
+    from ..kernels.geometry import apply_pose, carry_segments
     from ..model import quantise_pose
 
     config, n = FoldConfig(), 12
@@ -70,7 +70,7 @@ def warm_fold() -> None:
     starts, origins = np.array([0, n], np.int64), np.zeros((1, 3), np.int32)
     still = quantise_pose(np.eye(4))
     apply_pose(still, places, places.copy(), alive)
-    carry(np.stack([still, still])[None], starts, places, places.copy(), origins, alive)
+    carry_segments(np.stack([still, still])[None], starts, places, places.copy(), origins, alive)
     block = Block(
         author=0,
         base=0,

@@ -14,6 +14,7 @@ import msgspec
 
 from ..config import Config, _Checked, load_config
 from ..model import ConfigError
+from .ros.config import RosConfig
 from .sources import Options
 
 _MAX_FILE_NAME = 255  # bytes, of one part of a path
@@ -141,12 +142,15 @@ class AgentConfig(Config, frozen=True, kw_only=True, forbid_unknown_fields=True)
     store: StoreConfig
     keys: str = "."  # in a closed fleet: the folder that `dagmap keys enroll` made
     source: SourceConfig | None = None
+    ros: RosConfig | None = None  # a SLAM that runs, instead of a recording
     network: NetworkConfig = NetworkConfig()
     metrics: MetricsConfig = MetricsConfig()
     control: ControlConfig = ControlConfig()
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.source is not None and self.ros is not None:
+            raise ConfigError("[source] and [ros]: one robot has one SLAM; remove one of the two")
         rate = self.network.receive_bytes_per_second_per_robot
         least = self.sync.chunk_bytes + (1 << 16)
         if rate < least:  # no question would ever come through

@@ -56,7 +56,7 @@ def apply_pose(pose: Int32s, points: Int32s, out: Int32s, inside: Bools) -> None
 
 
 @kernel
-def carry(
+def carry_segments(
     poses: Int32s, starts: Int64s, points: Int32s, out: Int32s, origins: Int32s, inside: Bools
 ) -> None:
     """Carry segments of points through two poses each: out = poses[k, 1] * (poses[k, 0] * points).
@@ -75,6 +75,13 @@ def carry(
         apply_pose(poses[k, 1], out[begin:end], out[begin:end], inside[begin:end])
         apply_pose(poses[k, 0], origins[k : k + 1], origins[k : k + 1], at)
         apply_pose(poses[k, 1], origins[k : k + 1], origins[k : k + 1], at)
+
+
+def carry(pose: Int32s, points: Int32s) -> tuple[Int32s, Bools]:
+    """Points (N, 3) mm through a pose, and which of them stay within range."""
+    out, inside = np.empty_like(points), np.ones(len(points), np.bool_)
+    apply_pose(pose, points, out, inside)
+    return out, inside
 
 
 def compose(outer: Int32s, inner: Int32s) -> Int32s:

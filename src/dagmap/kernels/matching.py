@@ -21,7 +21,7 @@ X, Y, Z, OLDER = 0, 1, 2, 3  # columns of Nodes.seed; OLDER: next node of the sa
 AUTHOR, HITS, CYCLE, NEXT, SEEN = 0, 1, 2, 3, 4  # columns of Nodes.entries
 NODES, ENTRIES = 0, 1  # places in Nodes.sizes
 FIRST_SEEN = -1  # undo: the observation made the author's entry at the node
-MOMENTS = 3  # as many make a place lasting; more are not told apart
+MOMENTS = 6  # as many make a place lasting; more are not told apart
 NOT_COUNTED = -2  # undo: no hit, the author's cycle had counted already
 
 

@@ -92,7 +92,7 @@ def folder_name(path: Path) -> str:
     return Path(os.path.abspath(path)).name
 
 
-def checked(cycle: Cycle, path: Path) -> Cycle:
+def checked(cycle: Cycle, path: Path | str) -> Cycle:
     """The same cycle. Raises RecordingError naming the file where an agent would refuse it."""
     try:
         quantise_cycle(cycle)
