@@ -219,6 +219,7 @@ def test_the_site_builds_without_a_warning_and_fetches_nothing(tmp_path: Path) -
         assert not fetched, page.name
     api = (tmp_path / "site" / "api.html").read_text()
     assert "observe" in api and "strictly increasing within a session" in api
+    assert "observations within it are twins" in api  # a comment in the code
 
 
 def test_every_page_is_in_the_navigation() -> None:

@@ -194,7 +194,8 @@ def _kitti_poses(file: Path, rows: list[tuple[int, list[str]]], path: Path) -> l
     for number, words in rows:
         pose = np.eye(4)
         pose[:3] = np.reshape(numbers(file, number, words, 12), (3, 4))
-        poses.append(inverse(mounted) @ pose @ mounted)
+        with np.errstate(over="ignore", invalid="ignore"):  # what is no pose is refused later
+            poses.append(inverse(mounted) @ pose @ mounted)
     if not poses:
         raise RecordingError(f"{file}: no poses; 12 numbers (KITTI) or 8 (TUM) a line are wanted")
     return poses
