@@ -105,7 +105,12 @@ def frames_found(walk: Walk) -> Candidates:
 
 
 def fleet_map(walk: Walk, config: Config) -> WorldMap:
-    """What a robot that listens to all others holds in the end.
+    """The map that the robots agree on."""
+    return listener(walk, config).map
+
+
+def listener(walk: Walk, config: Config) -> Agent:
+    """A robot that listens to all others, in the end.
 
     The robots' cycles come by their stamps. The map is a pure function of the transactions, so it
     does not matter that nobody else folds them.
@@ -113,27 +118,27 @@ def fleet_map(walk: Walk, config: Config) -> WorldMap:
     config = msgspec.structs.replace(
         config, transaction=msgspec.structs.replace(config.transaction, proof_of_work_bits=0)
     )
-    listener = Agent(Identity.from_seed(bytes(32)), config)
+    agent = Agent(Identity.from_seed(bytes(32)), config)
     robots = [Agent(Identity.from_seed(bytes([1 + i]) * 32), config) for i in range(3)]
     order = sorted(
         ((frame.stamp, i, frame) for i, robot in enumerate(walk.robots) for frame in robot),
         key=lambda item: item[:2],
     )
     for stamp, i, frame in order:
-        _tell(listener, robots[i], robots[i].observe(frame.cycle(), now=stamp))
+        _tell(agent, robots[i], robots[i].observe(frame.cycle(), now=stamp))
     now = order[-1][0]
     while any(robot.holds_back for robot in robots):
         now += PERIOD
         for robot in robots:
-            _tell(listener, robot, robot.tick(now))
-    return listener.map
+            _tell(agent, robot, robot.tick(now))
+    return agent
 
 
-def _tell(listener: Agent, robot: Agent, events: list[object]) -> None:
+def _tell(agent: Agent, robot: Agent, events: list[object]) -> None:
     me = robot.identity.author
     for event in events:
         if isinstance(event, Accepted):
-            listener.receive(encode(Transactions((event.data,)), robot.config, me), 0.0)
+            agent.receive(encode(Transactions((event.data,)), robot.config, me), 0.0)
 
 
 METHODS: dict[str, Callable[[Walk], Candidates]] = {

@@ -23,9 +23,11 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial import cKDTree
 
+import merging
 import office
+from dagmap import Config
 from dagmap.metrics import thin
-from filters import METHODS
+from filters import METHODS, listener
 from office import Points, Walk
 
 WITHIN = 0.05  # m
@@ -158,10 +160,17 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--quick", action="store_true", help="one seed of DAGmap without offsets")
     parser.add_argument("--json", action="store_true", help="one JSON object a row and condition")
+    parser.add_argument(
+        "--merging", action="store_true", help="merged positions against single observations"
+    )
     chosen = parser.parse_args()
     if chosen.quick:
         chosen.seeds, chosen.conditions, chosen.methods = 1, list(QUICK), ["DAGmap default"]
     walk = office.load(chosen.data, chosen.cache)
+    if chosen.merging:
+        found = merging.measure(walk, lambda changed: listener(changed, Config()), chosen.seeds)
+        print(json.dumps(found, indent=2))
+        return
     rows = []
     for name in chosen.conditions:
         rows += measure(walk, name, chosen.seeds, chosen.methods)

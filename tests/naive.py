@@ -185,7 +185,7 @@ class Node:
         self.observations.append(points(block.xyz)[i])
         self.authors.add(block.author)
         self.seen[block.author] += 1
-        if block.colored[i]:
+        if block.colored[segment(block, i)]:
             self.colors.append(points(block.color)[i])
 
     def hit(self, author: int, cycle: int) -> None:
@@ -198,6 +198,11 @@ class Node:
         total = tuple(sum(o[k] for o in offsets) for k in range(3))
         color = tuple(sum(c[k] for c in self.colors) for k in range(3))
         return self.seed, total, len(self.observations), color, len(self.colors)  # type: ignore[return-value]
+
+
+def segment(block: Block, i: int) -> int:
+    """The segment of feature i."""
+    return max(k for k, start in enumerate(block.starts[:-1].tolist()) if start <= i)
 
 
 @dataclass
@@ -244,10 +249,10 @@ def naive_default(config: FoldConfig, blocks: Sequence[Block]) -> NaiveMap:
             near = fold.nearest(range(len(fold.nodes)), point) if fold.nodes else None
             if near is None or near[0] > config.delta_mm**2:
                 near = (0, len(fold.nodes))
-                fold.nodes.append(Node(point, origin=points(block.origin)[i]))
+                fold.nodes.append(Node(point, origin=points(block.origin)[segment(block, i)]))
             numbers[block.base + i] = near[1]
             fold.nodes[near[1]].observe(block, i)
-            fold.nodes[near[1]].hit(block.author, int(block.cycle[i]))
+            fold.nodes[near[1]].hit(block.author, int(block.cycle[segment(block, i)]))
         for number, cycle in zip(
             block.sightings.tolist(), block.sighting_cycle.tolist(), strict=True
         ):
@@ -412,8 +417,7 @@ def cube_of(config: FoldConfig, node: Node) -> Cell:
 
 def naive_misses(config: FoldConfig, fold: NaiveMap, rays: NaiveRays) -> list[int]:
     """What counts against each node; see `dagmap.weighing`."""
-    against, support, passed, hidden, brief = [], [], [], [], []
-    excess: Counter[Cell] = Counter()  # by cube of two cells
+    against, support, passed, ended, hidden, moments = [], [], [], [], [], []
     for node in fold.nodes:
         cell, before = rays.cell_of(node.seed), naive_hidden(rays, node)
         passes = {a: rays.passes[a, cell] for a in authors_of(rays)}
@@ -424,13 +428,13 @@ def naive_misses(config: FoldConfig, fold: NaiveMap, rays: NaiveRays) -> list[in
         near = [n for n in fold.nodes if distance2(n.seed, node.seed) <= config.support_mm**2]
         parts = sum((n.seen for n in near), Counter[int]())
         support.append(sum(min(16, n) for n in parts.values()))
-        moments = {(a, cycle) for n in near for a, cycle in n.last.items()}
-        brief.append(max(len(moments), *(h for n in near for h in n.hits.values())) < 3)
-        ended = sum(min(32, rays.ends[a, cell]) for a in passes)
-        excess[cube_of(config, node)] += 3 * passed[-1] - 4 * ended
+        last = {(a, cycle) for n in near for a, cycle in n.last.items()}
+        moments.append(max(len(last), *(h for n in near for h in n.hits.values())))
+        ended.append(sum(min(32, rays.ends[a, cell]) for a in passes))
     observed = sum((n.seen for n in fold.nodes), Counter[int]())
     lonely = [n for n, s, a in zip(fold.nodes, support, against, strict=True) if s <= 1 and a > 0]
     discredited = sum((n.seen for n in lonely), Counter[int]())
+    all_gone = naive_gone(config, fold, moments, passed, ended)
     out = []
     for k, node in enumerate(fold.nodes):
         record = min(naive_log2(200 * discredited[a] // observed[a] + 1) for a in node.seen)
@@ -440,11 +444,36 @@ def naive_misses(config: FoldConfig, fold: NaiveMap, rays: NaiveRays) -> list[in
         balance += 6 * (naive_log2(length) - naive_log2(config.delta_mm))
         balance -= naive_log2(1 + passed[k]) + 2 * naive_log2(1 + hidden[k])
         balance -= 2 * record + 16 * config.doubt
-        x, y, z = cube_of(config, node)
-        around = sum(excess[x + i, y + j, z + h] for i, j, h in product((-1, 0, 1), repeat=3))
-        gone = brief[k] and around > 0 and config.miss_say > 0
+        gone = all_gone[k] and config.miss_say > 0
         counted = 1 if against[k] == 0 and (record > 0 or gone) else against[k]
         out.append(counted if balance <= 0 or gone else 0)
+    return out
+
+
+def naive_gone(
+    config: FoldConfig, fold: NaiveMap, moments: list[int], passed: list[int], ended: list[int]
+) -> list[bool]:
+    """Which nodes have left together with what was seen beside them; see `dagmap.weighing`."""
+    cubes = [cube_of(config, node) for node in fold.nodes]
+    # that of the author who was the last to meet the node
+    when = [list(node.last.items())[-1] for node in fold.nodes]
+    numbers = range(len(cubes))
+    about = [
+        [j for j in numbers if all(abs(a - b) <= 1 for a, b in zip(cubes[j], cube, strict=True))]
+        for cube in cubes
+    ]
+    crossed = []
+    for k in numbers:
+        brief = [j for j in about[k] if moments[j] < 3]
+        sums = [sum(passed[j] for j in brief), sum(ended[j] for j in brief)]
+        logs = [naive_log2(max(1, n)) for n in (*sums, sum(ended[j] for j in about[k]))]
+        balance = logs[0] + 2 * (logs[1] - logs[2]) - 2 * naive_log2(moments[k])
+        crossed.append(moments[k] < 3 and balance >= 62)
+    out = []
+    for k in numbers:
+        together = [j for j in about[k] if when[j] == when[k]]
+        left = sum(crossed[j] for j in together)
+        out.append(moments[k] < 6 and left >= 4 and 2 * left >= len(together))
     return out
 
 

@@ -105,7 +105,9 @@ class DefaultFold:
         entries = self._nodes.entries[: int(self._nodes.sizes[matching.ENTRIES])]
         record = weighing.records(found, self._nodes.first[:n], entries, self._authors)
         place = weighing.blocks(self._nodes.seed[:n, :3], 2 * config.cell_mm)
-        gone = weighing.gone(found, place, matching.MOMENTS if config.miss_say else 0)
+        newest = entries[self._nodes.first[:n]].astype(np.int64)
+        moment = newest[:, matching.AUTHOR] << 32 | newest[:, matching.CYCLE]
+        gone = weighing.gone(found, place, moment) & (config.miss_say > 0)
         misses = weighing.misses(found, record, gone, config.delta_mm, config.doubt)
         return verdict_of(found.hits, misses, found.witnesses, config.witnesses)
 
@@ -148,6 +150,7 @@ def _seen(block: Block) -> matching.Seen:
     return matching.Seen(
         plain(block.xyz),
         plain(block.alive),
+        plain(block.starts),
         plain(block.cycle),
         plain(block.color),
         plain(block.colored),

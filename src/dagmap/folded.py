@@ -21,6 +21,7 @@ TRANSACTION = 32  # units for each, beside its features
 _OBSERVATIONS = 2  # that meet their nodes in a unit
 _RAY_CELLS = 32  # that a ray crosses in a unit
 _BYTES = 1024  # copied in a unit
+_DECODED = 2  # units for each feature that is read from the wire again
 
 
 @dataclass(slots=True)
@@ -160,7 +161,7 @@ class Folded:
 
     def place_units(self, contribution: Contribution) -> int:
         """Work of placing and walking (again)."""
-        decoded = 0 if contribution.fresh else len(contribution.xyz)
+        decoded = 0 if contribution.fresh else _DECODED * len(contribution.xyz)
         walks = 2 if contribution.parts else 1  # what was placed before is taken back first
         return decoded + walks * self.walk_units(contribution)
 

@@ -57,7 +57,7 @@ class Issuance:
         self.seen_again: Int32s = np.zeros(0, np.int32)  # latest cycle that saw it again, or -1
         self._again: list[Int64s] = []
         self._news = False  # whether `_again` may hold what can go out
-        self._ripe: Int64s = np.zeros(0, np.int64)
+        self._ripened: list[Int64s] = [np.zeros(0, np.int64)]
         self._allowance = 0.0
         self._last: float | None = None
         self._sealed_at: float | None = None
@@ -178,7 +178,7 @@ class Issuance:
         if len(cores) > limit:
             cores = self._news_first(cores, limit, known)
         taken, frontier, done, changed = self.graph.take(cores, per_bundle, limit)
-        self._ripe = cores[done:]
+        self._ripened = [cores[done:]]
         self._ripen(frontier)  # the nearest truncated inherit the core's validity (5.2)
         self.revalue(changed)
         return taken
@@ -197,7 +197,14 @@ class Issuance:
 
     def _ripen(self, nodes: Int64s) -> None:
         if len(nodes):
-            self._ripe = np.concatenate([self._ripe, nodes])
+            self._ripened.append(nodes)
+
+    @property
+    def _ripe(self) -> Int64s:
+        """What was valid when it was looked at, in any order and number."""
+        if len(self._ripened) > 1:
+            self._ripened = [np.concatenate(self._ripened)]
+        return self._ripened[0]
 
     def _sightings(self) -> tuple[Sighting, ...]:
         """Repeated observations of features that are out by now, by cycle."""

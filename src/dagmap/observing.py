@@ -16,8 +16,8 @@ from .config import Config
 from .graph import AdjacencyDag
 from .issuance import ROOM, Allowance, Issuance, Known
 from .kernels.codec import morton_order
-from .kernels.columns import distinct, grown
-from .kernels.geometry import apply_pose
+from .kernels.columns import distinct
+from .kernels.geometry import carry
 from .keyframes import Keyframes, fill
 from .model import (
     FLEET_FRAME,
@@ -31,11 +31,11 @@ from .model import (
     quantise_pose,
 )
 from .payload import CERTAIN, Anchor, Link, Payload, Sighting
+from .rearranging import LEFT, Rearranging
 from .transaction import Transaction
 
 Settled: TypeAlias = Callable[[Int32s], Bools]  # of points (N, 3) mm in the SLAM frame
-_LEFT = -2  # node of an id whose point is left for later; -1: it has none for other reasons
-_REARRANGED = 2048  # nodes that leave the DAG, or come back elsewhere, in one call
+REARRANGED = 2048  # units in which nodes leave the DAG, or come back elsewhere, in one call
 _MOST_MOVED, _MOST_RETRACTED = 1024, 16_384  # that go out in one call
 # Bytes that each costs at most in a transaction
 _FEATURE, _PARENT, _ANCHOR, _NUMBER, _SIGHTING = 22, 6, 48, 6, 16
@@ -66,10 +66,7 @@ class Observing:
         """A new SLAM frame has its own adjacency DAG, ids and cycles."""
         self.graph = AdjacencyDag(self._config.graph, self._salt)
         self.issuance = Issuance(self._config, self.graph)
-        self._nodes: dict[int, int] = {}  # node of each id that the SLAM gave and did not remove
-        self._id_of: npt.NDArray[np.uint64] = np.zeros(0, np.uint64)  # by node, where it has one
-        self._leaving: list[Int64s] = []  # nodes that were removed, still in the DAG
-        self._moving: list[Anchor] = []  # whose unissued nodes are still where they were
+        self._arrangement = Rearranging(self.issuance, self._salt)
         self._cycle_of: dict[int, int] = {}  # cycle number of a stamp
 
     def resume(self, chain: Sequence[Transaction]) -> None:
@@ -95,12 +92,10 @@ class Observing:
                 f"{last / 1e6:.6f} s; hand cycles in by time, or start a new session"
             )
         fresh = cycle.session != self.session
-        known = {} if fresh else self._nodes
-        ids = cycle.removed.tolist()
-        if not all(map(known.__contains__, ids)):
-            unknown = next(id_ for id_ in ids if id_ not in known)
+        unknown = cycle.removed if fresh else self._arrangement.unknown(cycle.removed)
+        if len(unknown):
             raise CycleError(
-                f"{where}: removed names {unknown}, which this session has not seen or has "
+                f"{where}: removed names {unknown[0]}, which this session has not seen or has "
                 "removed before; name ids once, after their point"
             )
         cycles = {} if fresh else self._cycle_of
@@ -110,7 +105,7 @@ class Observing:
                     f"{where}: moved names a cycle at {stamp / 1e6:.6f} s, which this session "
                     "has not seen; give the exact stamps of earlier cycles"
                 )
-        _, inside = _carry(cycle.pose, cycle.points)
+        _, inside = carry(cycle.pose, cycle.points)
         if not inside.all():
             row = int(np.flatnonzero(~inside)[0])
             raise CycleError(f"{where}: the pose carries points row {row} beyond 2^29 mm; drop it")
@@ -121,41 +116,18 @@ class Observing:
         if cycle.session != self.session or not self._sessions:
             self._enter(cycle.session)
         if len(cycle.removed):
-            nodes = np.sort(np.array(list(map(self._nodes.pop, cycle.removed.tolist())), np.int64))
-            self._leaving.append(nodes[nodes >= 0])  # others were thrown out of range by a move
+            self._arrangement.remove(cycle.removed)
         moved = [Anchor(self._cycle_of[s], self.session, s, pose) for s, pose in cycle.moved]
         for anchor in moved:
             self.backlog.move(anchor.cycle, anchor.pose)
+            self._arrangement.move(anchor.cycle, anchor.pose)
         self._moved += moved
-        self._moving += moved
 
-    def rearrange(self, limit: int = _REARRANGED) -> None:
-        """Do in the DAG what `withdraw` took, for about so many nodes.
-
-        What is not done in this call stays where it is, which is only a matter of structure: should
-        it go out before, then it is retracted, or its anchor has moved.
-        """
-        while self._leaving and limit > 0:
-            nodes, rest = self._leaving[0][:limit], self._leaving[0][limit:]
-            self._leaving[:1] = [rest] if len(rest) else []
-            numbers = self.issuance.number[nodes]
-            self._retracted.append(numbers[numbers >= 0])
-            self.issuance.revalue(self.graph.withdraw(nodes))
-            limit -= len(nodes)
-        unissued = self.issuance.unissued() if self._moving and limit > 0 else NONE
-        batch: list[tuple[Int64s, Int32s]] = []
-        done = 0
-        while done < len(self._moving) and limit > 0:
-            anchor = self._moving[done]
-            if any(anchor.cycle == moved.cycle for moved in self._moving[:done]):
-                break  # moved again: the nodes have to be there first
-            done += 1
-            mine = self.issuance.cycle[unissued] == anchor.cycle
-            if mine.any():
-                batch.append((unissued[mine], anchor.pose))
-                limit -= int(mine.sum())
-        del self._moving[:done]
-        self._reinsert(batch)
+    def rearrange(self, limit: int = REARRANGED) -> None:
+        """Do in the DAG what `withdraw` took, for about so many units (see `rearranging`)."""
+        numbers = self._arrangement.step(limit)
+        if len(numbers):
+            self._retracted.append(numbers)
 
     def insert(
         self, cycle: QuantisedCycle, now: float, settled: Settled, limit: int | None = None
@@ -179,7 +151,7 @@ class Observing:
         if limit is not None and len(order) > limit:
             seen, rest = seen.split(limit)
             if rest.ids is not None:
-                self._nodes.update(dict.fromkeys(rest.ids.tolist(), _LEFT))
+                self._arrangement.leave(rest.ids)
             self.backlog.add(rest)
         self._append(seen, settled)
 
@@ -192,32 +164,25 @@ class Observing:
         for seen in self.backlog.take(limit):
             looked += len(seen.points)
             if seen.ids is not None:
-                still = [self._nodes.get(id_) == _LEFT for id_ in seen.ids.tolist()]
-                seen = seen.rows(np.array(still, np.bool_))
+                seen = seen.rows(self._arrangement.nodes(seen.ids) == LEFT)
             self._append(seen, settled)
         return looked
 
     def _append(self, seen: Seen, settled: Settled) -> None:
-        positions, inside = _carry(seen.pose, seen.points)
+        positions, inside = carry(seen.pose, seen.points)
         fresh = inside & ~settled(positions)
-        if seen.ids is not None:
-            self._nodes.update(dict.fromkeys(seen.ids[~fresh].tolist(), -1))
-        seen = seen.rows(fresh)
+        ids, seen = seen.ids, seen.rows(fresh)
         count = len(seen.points)
         nodes = self.graph.insert(positions[fresh])
-        if seen.ids is not None and len(nodes):
-            self._id_of = grown(self._id_of, int(nodes[-1]) + 1, 0)
-            self._id_of[nodes] = seen.ids
         color = np.zeros((count, 3), np.uint8) if seen.colors is None else seen.colors
         colored = np.full(count, seen.colors is not None, np.bool_)
         cycle = np.full(count, seen.cycle, np.int32)
         self.issuance.add(nodes, cycle, seen.points, color, colored)
-        if seen.ids is not None:
-            self._nodes.update(zip(seen.ids.tolist(), nodes.tolist(), strict=True))
+        self._arrangement.entered(seen.cycle, ids, fresh, nodes)
 
     def node_of(self, id_: int) -> int:
         """The node of an id that the SLAM gave; -1 where it is unknown or has left."""
-        return max(self._nodes.get(id_, -1), -1)
+        return max(int(self._arrangement.nodes(np.array([id_], np.uint64))[0]), -1)
 
     def relate(self, links: Iterable[Link], wanted: bool) -> None:
         """Publish links of the robot's own frames; and its described points, where `wanted`."""
@@ -227,7 +192,7 @@ class Observing:
     @property
     def rearranging(self) -> bool:
         """Whether `rearrange` has something to do."""
-        return bool(self._leaving or self._moving)
+        return self._arrangement.busy
 
     @property
     def waiting(self) -> bool:
@@ -315,66 +280,16 @@ class Observing:
 
     def _first_seen(self, ids: npt.NDArray[np.uint64], order: Int64s, cycle: int) -> Int64s:
         """The rows whose id is new, once each; the others are seen again."""
-        new, again = [], []
-        met: set[int] = set()
-        for row, id_ in zip(order.tolist(), ids[order].tolist(), strict=True):
-            if id_ in met:
-                continue
-            met.add(id_)
-            node = self._nodes.get(id_)
-            if node is None or node < 0:
-                new.append(row)
-            else:
-                again.append(node)
-        if again:
-            self.issuance.see_again(np.array(again, np.int64), cycle)
-        return np.array(new, np.int64)
-
-    def _reinsert(self, batch: list[tuple[Int64s, Int32s]]) -> None:
-        """Unissued nodes of cycles that a loop closure moved come back where they are now."""
-        if not batch:
-            return
-        leaving = np.sort(np.concatenate([old for old, _ in batch]))
-        self.issuance.revalue(self.graph.withdraw(leaving))
-        for old, pose in batch:
-            columns = self.issuance
-            positions, inside = _carry(pose, columns.place[old])
-            nodes, kept = self.graph.insert(positions[inside]), old[inside]
-            columns.add(
-                nodes,
-                columns.cycle[kept],
-                columns.place[kept],
-                columns.color[kept],
-                columns.colored[kept],
-            )
-            self._rename(old, kept, nodes)
-
-    def _rename(self, old: Int64s, kept: Int64s, nodes: Int64s) -> None:
-        """The ids of old nodes name new ones; of those that were not kept, none."""
-        names = self._names(old)
-        self._nodes.update(dict.fromkeys(names.values(), -1))
-        self._id_of = grown(self._id_of, len(self.graph), 0)
-        for before, after in zip(kept.tolist(), nodes.tolist(), strict=True):
-            if before in names:
-                self._nodes[names[before]] = after
-                self._id_of[after] = names[before]
-
-    def _names(self, nodes: Int64s) -> dict[int, int]:
-        """The id that the SLAM gave, of those of these nodes that have one."""
-        ids = self._id_of[nodes[nodes < len(self._id_of)]].tolist()
-        named = zip(nodes.tolist(), ids, strict=False)
-        return {node: id_ for node, id_ in named if self._nodes.get(id_) == node}
+        _, first = np.unique(ids[order], return_index=True)
+        first = np.sort(first)
+        nodes = self._arrangement.nodes(ids[order[first]])
+        if (nodes >= 0).any():
+            self.issuance.see_again(nodes[nodes >= 0], cycle)
+        return order[first[nodes < 0]]
 
 
 def _nothing(points: Int32s) -> Bools:
     return np.zeros(len(points), np.bool_)
-
-
-def _carry(pose: Int32s, points: Int32s) -> tuple[Int32s, Bools]:
-    """Points through a pose, and which of them stay within range."""
-    out, inside = np.empty_like(points), np.ones(len(points), np.bool_)
-    apply_pose(pose, points, out, inside)
-    return out, inside
 
 
 def _fill(sightings: list[Sighting], room: int) -> tuple[tuple[Sighting, ...], list[Sighting], int]:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .kernels.matching import AUTHOR, NEXT, SEEN
+from .kernels.matching import AUTHOR, MOMENTS, NEXT, SEEN
 from .model import Bools, Int32s, Int64s
 
 SIXTEENTHS = 16
@@ -24,6 +24,10 @@ _HALF = 1 << 20
 _STRIDES = np.array([1 << 42, 1 << 21, 1], np.int64)
 _CUBE = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), axis=-1).reshape(-1, 3)
 _PER_SHARE = 200  # the record counts in half percents
+_BRIEF = 3  # moments: what was seen in fewer around a place speaks of what comes and goes
+_LASTING = MOMENTS  # moments: what was seen in as many around it is not gone
+_CROSSED = 62  # sixteenths of bits, 15 in all: see `crossed`
+_TOGETHER = 4  # nodes of one moment that are crossed, in the cubes about a node
 
 
 class Evidence(NamedTuple):
@@ -79,21 +83,61 @@ def blocks(seed: Int32s, edge: int) -> Int64s:
     return np.asarray(place @ _STRIDES)
 
 
-def gone(found: Evidence, place: Int64s, lasting: int) -> Bools:
-    """(N,) whether a node was there for a moment, in a part of space that is empty else.
+def crossed(found: Evidence, place: Int64s) -> Bools:
+    """(N,) whether a node was there briefly, where rays cross what was there briefly.
 
-    Seen around it in fewer than `lasting` cycles; and in the 27 cubes about it (`blocks`) rays
-    have passed the nodes' cells a third more often than points have ended there. One ray that
-    grazes an edge does not do that; where somebody has walked by, everything says so.
+    In the 27 cubes about it (`blocks`), with only brief nodes: 15 rays or more have passed their
+    cells, times the squared share that their cells have of all ends; four times as many where it
+    was seen in two moments. One ray that grazes an edge does not do that, nor do many where most of
+    what is seen lasts; where somebody has walked by, everything says so.
     """
     cubes, at = np.unique(place, return_inverse=True)
-    balance = np.zeros(len(cubes), np.int64)
-    np.add.at(balance, at, 3 * found.passed.astype(np.int64) - 4 * found.ended)
-    around = np.zeros(len(cubes), np.int64)
+    brief = found.moments < _BRIEF
+    passed, share, ended = (
+        log2_16(np.maximum(_about(cubes, np.bincount(at, column, len(cubes)))[at], 1))
+        for column in (brief * found.passed, brief * found.ended, found.ended)
+    )
+    balance = passed + 2 * (share - ended) - 2 * log2_16(np.maximum(found.moments, 1))
+    return np.asarray(brief & (balance >= _CROSSED))
+
+
+def gone(found: Evidence, place: Int64s, moment: Int64s) -> Bools:
+    """(N,) whether a node left together with what was seen beside it.
+
+    Of the nodes in the 27 cubes about it that were seen last in the same moment, half or more are
+    `crossed`, and four at least. So what no ray came through, as feet, goes with the rest;
+    and what merely lies where somebody was seen at another time stays.
+    moment: (N,) a number for the author and cycle that saw each node last.
+    """
+    marked = crossed(found, place)
+    moments, when, count = np.unique(moment[marked], return_inverse=True, return_counts=True)
+    out = np.zeros(len(place), np.bool_)
+    asked = np.flatnonzero(np.isin(moment, moments[count >= _TOGETHER]))
+    if len(asked) == 0:
+        return out
+    when = np.searchsorted(moments, moment[asked])
+    cubes, at = np.unique(place[asked], return_inverse=True)
+    groups, group = np.unique(when * len(cubes) + at, return_inverse=True)
+    with_them = _about(cubes, np.bincount(group, marked[asked]), groups)[group]
+    of_all = _about(cubes, np.bincount(group), groups)[group]
+    left = (with_them >= _TOGETHER) & (2 * with_them >= of_all)
+    out[asked] = left & (found.moments[asked] < _LASTING)
+    return out
+
+
+def _about(cubes: Int64s, values: npt.NDArray[np.generic], groups: Int64s | None = None) -> Int64s:
+    """Sums of whole values over the 27 cubes about each cube; or about each group, where a group
+    is a part of a cube: cubes times its kind, plus the place of its cube in `cubes` (ascending)."""
+    groups = np.arange(len(cubes)) if groups is None else groups
+    kind, at = np.divmod(groups, len(cubes))
+    whole, out = values.astype(np.int64), np.zeros(len(groups), np.int64)
     for shift in (_CUBE @ _STRIDES).tolist():
-        other = np.searchsorted(cubes, cubes + shift).clip(max=max(len(cubes) - 1, 0))
-        around += np.where(cubes[other] == cubes + shift, balance[other], 0)
-    return np.asarray((around[at] > 0) & (found.moments < lasting))
+        beside = np.searchsorted(cubes, cubes + shift).clip(max=len(cubes) - 1)
+        there = cubes[beside] == cubes + shift
+        wanted = kind * len(cubes) + beside[at]
+        other = np.searchsorted(groups, wanted).clip(max=len(groups) - 1)
+        out += np.where(there[at] & (groups[other] == wanted), whole[other], 0)
+    return out
 
 
 def misses(found: Evidence, record: Int64s, gone: Bools, delta_mm: int, doubt: int) -> Int32s:

@@ -25,7 +25,7 @@ _Topic = Annotated[
 ]
 _Frame = Annotated[str | None, typer.Option(help="Of a bag with tf: the frame that stands still.")]
 _SameFrame = Annotated[bool, typer.Option(help="Poses are the sensor's, whatever frames say.")]
-_Poses = Annotated[Path | None, typer.Option(help="File of poses beside clouds: TUM or KITTI.")]
+_Poses = Annotated[Path | None, typer.Option(help="File of poses, TUM or KITTI (clouds, EuRoC).")]
 _Voxel = Annotated[float, typer.Option(help="Of a cloud one point a voxel is kept, m.")]
 _KeepGoing = Annotated[bool, typer.Option(help="Leave out what cannot be read.")]
 

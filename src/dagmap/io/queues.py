@@ -8,6 +8,7 @@ import time
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 from ..messages import Kind, kind_of, sender_of
 from ..model import AuthorId, Cycle, Outgoing
@@ -24,10 +25,14 @@ class Work:
 
 @dataclass(slots=True)
 class Question:
-    """Somebody in another thread wants to know the agent's state."""
+    """Somebody in another thread wants to know the agent's state.
 
+    look: what makes the answer, in the agent's thread, given the runtime; None: its report.
+    """
+
+    look: Callable[[Any], Any] | None = None
     answered: threading.Event = field(default_factory=threading.Event)
-    answer: dict[str, object] | None = None
+    answer: Any = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ import msgspec
 
 from ..config import Config, _Checked, load_config
 from ..model import ConfigError
+from .ros.config import RosConfig
 from .sources import Options
 
 _MAX_FILE_NAME = 255  # bytes, of one part of a path
@@ -25,6 +26,7 @@ class SourceConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     path: str  # any recording that `dagmap inspect` knows
     max_features: int = 1000  # points that a frame of pictures gives at most
     camera: str | None = None  # a camera.json to use instead of the recording's own
+    poses: str | None = None  # a file of poses: TUM, or KITTI beside clouds
     max_depth: float | None = None  # m, points beyond are dropped
     topics: tuple[str, ...] = ()  # of a bag; what is not named is found by its type
     frame: str | None = None  # of a bag with tf: the frame that stands still
@@ -32,10 +34,11 @@ class SourceConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     voxel: float = 0.1  # m: of a cloud one point a voxel is kept
     keep_going: bool = False  # leave out what cannot be read
 
-    def options(self, camera: Path | None) -> Options:
+    def options(self, camera: Path | None, poses: Path | None = None) -> Options:
         """What the readers take. Raises ConfigError where one is out of its range."""
         return Options(
             camera=camera,
+            poses=poses,
             max_features=self.max_features,
             max_depth=self.max_depth,
             topics=self.topics,
@@ -139,12 +142,15 @@ class AgentConfig(Config, frozen=True, kw_only=True, forbid_unknown_fields=True)
     store: StoreConfig
     keys: str = "."  # in a closed fleet: the folder that `dagmap keys enroll` made
     source: SourceConfig | None = None
+    ros: RosConfig | None = None  # a SLAM that runs, instead of a recording
     network: NetworkConfig = NetworkConfig()
     metrics: MetricsConfig = MetricsConfig()
     control: ControlConfig = ControlConfig()
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.source is not None and self.ros is not None:
+            raise ConfigError("[source] and [ros]: one robot has one SLAM; remove one of the two")
         rate = self.network.receive_bytes_per_second_per_robot
         least = self.sync.chunk_bytes + (1 << 16)
         if rate < least:  # no question would ever come through

@@ -77,7 +77,7 @@ class Transport(Closing):
         self._queue = SendQueue(network.send_bytes)
         self._refused = 0  # messages that Zenoh did not take
         self.traffic = Traffic()
-        self._session = _open(self._zenoh, network, folder)
+        self._session = open_session(self._zenoh, network, folder)
         self._declared = self._declare()
         self._sender = threading.Thread(target=self._publish, name="dagmap send", daemon=True)
         self._sender.start()
@@ -213,7 +213,13 @@ def session_config(network: NetworkConfig, folder: Path) -> dict[str, object]:
     return out
 
 
-def _open(module: Any, network: NetworkConfig, folder: Path) -> zenoh.Session:
+def open_session(
+    module: Any, network: NetworkConfig, folder: Path, table: str = "network"
+) -> zenoh.Session:
+    """A session as the configuration wants it; table: what it is called in the robot's file.
+
+    Raises NetworkError that names the endpoint or the file.
+    """
     if network.tls is not None:
         for name, path in _tls_files(network.tls, folder).items():
             if not path.is_file():
@@ -223,12 +229,12 @@ def _open(module: Any, network: NetworkConfig, folder: Path) -> zenoh.Session:
         try:
             config.insert_json5(key, json.dumps(value))
         except module.ZError as error:
-            raise NetworkError(f"network: {json.dumps(value)}: {_brief(error)}") from None
+            raise NetworkError(f"{table}: {json.dumps(value)}: {_brief(error)}") from None
     try:
         return module.open(config)  # type: ignore[no-any-return]
     except module.ZError as error:
         ends = ", ".join((*network.listen, *network.connect)) or "no endpoint"
-        raise NetworkError(f"network ({ends}): {_brief(error)}; correct [network]") from None
+        raise NetworkError(f"{table} ({ends}): {_brief(error)}; correct [{table}]") from None
 
 
 def _tls_files(tls: TlsConfig, folder: Path) -> dict[str, Path]:

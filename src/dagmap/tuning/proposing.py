@@ -188,14 +188,15 @@ def _block(part: Points, base: int) -> Block:
         base=base,
         xyz=_mm(part.place),
         alive=np.ones(n, np.bool_),
-        cycle=np.full(n, part.cycle[0], np.int32),
+        starts=np.array([0, n], np.int64),
+        cycle=np.full(1, part.cycle[0], np.int32),
         color=np.zeros((n, 3), np.uint8),
-        colored=np.zeros(n, np.bool_),
+        colored=np.zeros(1, np.bool_),
         parents=None,
         cores=np.zeros(0, np.int64),
         sightings=np.zeros(0, np.int64),
         sighting_cycle=np.zeros(0, np.int32),
-        origin=_mm(part.place - part.ray * part.reach[:, None]),
+        origin=_mm(part.place[:1] - part.ray[:1] * part.reach[:1, None]),
     )
 
 
