@@ -181,9 +181,10 @@ class Fleet:
         return robot, what
 
     def agrees(self, robots: Iterable[Robot] | None = None) -> bool:
-        """Whether all ledgers count the same transactions and nothing waits to be sent."""
+        """Whether all ledgers count the same transactions, nothing waits to be sent, and all that
+        is known is folded."""
         agents = [robot.agent for robot in (self.robots.values() if robots is None else robots)]
-        if any(agent.holds_back or agent.searching for agent in agents):
+        if any(agent.holds_back or agent.searching or not agent.settled for agent in agents):
             return False
         first = _ends(agents[0]) if agents else {}
         return all(_ends(agent) == first for agent in agents[1:])
@@ -205,6 +206,8 @@ class Fleet:
         robot.bytes_received += len(data)
         if self._on_event is not None:
             self._on_event(robot, Received(len(data)))
+        if robot.liar is not None:
+            robot.liar.hear(data)
         self._after(robot, robot.agent.receive(data, robot.clock.at(self.now)))
 
     def _observe(self, robot: Robot, what: _Seen) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,12 +12,17 @@ from ..consensus import Consensus
 from ..graph import AdjacencyDag
 from ..identity import signature_holds
 from ..model import AuthorId, Int64s, State, TransactionId
-from ..sync import MAX_PEERS
 from ..transaction import Transaction, signed_part
 from .fleet import Fleet
 from .robot import Happening, Observed, Robot
 from .truth import transactions_anew
 
+# What a robot may hold at most, stated here once more and not taken from the code that is checked.
+_PEERS = 256  # other robots
+_HEADS = 1800  # of one of them
+_ASKED = 3600  # chains that were asked about
+_SENT = 64  # announcements that may be echoed
+_STORM = 4000  # events of one robot in a simulated second: beyond, they never end
 _EVERY = 200  # events of a robot between two looks at the whole map
 _MOST = np.iinfo(np.int64).max
 
@@ -51,15 +57,18 @@ class Invariants:
         self._observed: set[str] = set()
         self._signed: set[TransactionId] = set()
         self._robot = ""
+        self._second = 0  # of simulated time
+        self._busy: Counter[str] = Counter()  # events in it
 
     def saw(self, robot: Robot, happening: Happening) -> None:
         if isinstance(happening, Observed):
             self._observed.add(robot.name)
 
     def __call__(self, robot: Robot) -> None:
+        self._robot = robot.name
+        self._storm()
         if not robot.honest:
             return
-        self._robot = robot.name
         looked = self._looked.get(robot.name)
         if looked is None or looked.agent is not robot.agent:  # it was restarted
             self._nothing_lost(robot)
@@ -99,6 +108,16 @@ class Invariants:
             now = self.fleet.now if self.fleet is not None else 0.0
             raise Violation(name, self._robot, now, detail)
 
+    def _storm(self) -> None:
+        """Messages may cause messages, but not more and more of them: the run would never end."""
+        second = int(self.fleet.now) if self.fleet is not None else 0
+        if second != self._second:
+            self._second = second
+            self._busy.clear()
+        self._busy[self._robot] += 1
+        count = self._busy[self._robot]
+        self._require(count <= _STORM, "a storm", f"{count} events within a second")
+
     def _nothing_lost(self, robot: Robot) -> None:
         """What was stored and told of is there after a restart, and the own chain goes on."""
         held = {tx.id for tx in robot.agent.ledger}
@@ -122,7 +141,13 @@ class Invariants:
         self._require(sizes.waiting_bytes <= limits.waiting_bytes, "memory", f"{sizes}")
         left = sizes.waiting_bytes or sizes.waited_for
         self._require(bool(sizes.waiting) or not left, "memory", f"nothing waits, but {sizes}")
-        self._require(len(agent.sync.peers) <= MAX_PEERS, "memory", "peers")
+        ids = limits.waiting_transactions * (agent.config.transaction.max_references + 1)
+        most_of = {"peers": _PEERS, "_asked": _ASKED, "_sent_at": _SENT, "_asked_ids": ids}
+        for name, most in most_of.items():
+            size = len(getattr(agent.sync, name))
+            self._require(size <= most, "memory", f"{name}: {size}, at most {most}")
+        heads = max((len(peer.heads) for peer in agent.sync.peers.values()), default=0)
+        self._require(heads <= _HEADS, "memory", f"heads of a peer: {heads}")
 
     def _ledger(self, agent: Agent, looked: _Looked) -> None:
         """Chains are unbroken, dated as they must be, and signed; nothing leaves."""

@@ -105,6 +105,10 @@ class Liar(Protocol):
         """What the agent is told instead of what the SLAM saw."""
         ...
 
+    def hear(self, data: bytes) -> None:
+        """What has arrived, before the agent is told."""
+        ...
+
     def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:
         """What is sent instead of what the agent wants to send."""
         ...
