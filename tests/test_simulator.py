@@ -314,6 +314,25 @@ def test_divergence_rises_in_a_partition_and_ends_at_zero() -> None:
     assert report.agreed
 
 
+def test_robots_agree_when_they_have_folded_what_they_know() -> None:
+    """So small a step that maps lag behind the ledgers: agreement in knowledge comes first."""
+    ledger = msgspec.structs.replace(CALM.config.ledger, fold_per_tick=3)
+    config = msgspec.structs.replace(CALM.config, ledger=ledger)
+    slow = changed(CALM, config=config, seconds=5.05)
+    mission = Mission(slow, 1)
+    stages: list[str] = []
+    report = mission.run(lambda now: stages.append(mission.stage))
+    assert all(robot.agent.settled for robot in mission.honest)
+    assert report.agreed and report.agreement_s is not None and report.agreement_s < 0.1
+    assert report.map_agreement_s is not None and report.map_agreement_s > 1.0
+    assert list(dict.fromkeys(stages)) == ["simulating", "agreeing", "comparing maps"]
+    mission = Mission(changed(slow, patience=0.5), 1)
+    assert mission.play() is None, "knowing the same is not enough"
+    quick = Mission(changed(CALM, seconds=5.05), 1).run()
+    assert quick.agreement_s == report.agreement_s
+    assert quick.map_agreement_s is not None and quick.map_agreement_s < 0.3
+
+
 def test_agreement_counts_from_when_nothing_stood_in_its_way() -> None:
     quick = Mission(changed(CALM, seconds=5.05), 1).run()
     assert quick.agreement_s is not None and 0.002 <= quick.agreement_s <= 0.02 + 1e-9
