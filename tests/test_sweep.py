@@ -17,16 +17,18 @@ from dagmap.kernels import lattice
 from dagmap.ledger import Ledger
 from dagmap.messages import Heads
 from dagmap.model import Int32s
+from dagmap.overhead import Controller
 from dagmap.sim import liars
 from dagmap.sim import sweep as sweep_module
 from dagmap.sim.fleet import Crash
+from dagmap.sim.mission import Mission
 from dagmap.sim.network import Partition
 from dagmap.sim.robot import Happening, Restarted, Robot
 from dagmap.sim.scenario import Liars, Scenario, load_scenario
 from dagmap.sim.sweep import Failure, attempt, minimised, sweep, timeline_of
 
 FOLDER = Path(__file__).parents[1] / "scenarios"
-NAMES = ["wifi", "crashes", "partitions", "reach", "liars", "loops"]
+NAMES = ["wifi", "crashes", "partitions", "reach", "liars", "loops", "busy", "frames"]
 
 
 def scenario(name: str) -> Scenario:
@@ -38,6 +40,30 @@ def test_no_promise_is_broken(name: str) -> None:
     """A slice of `make sweep`."""
     failure = sweep([scenario(name)], range(9000, 9006))
     assert failure is None, failure
+
+
+def test_the_controller_raises_n_c_under_the_invariants() -> None:
+    """What slow processors are there for: N_c is another than the start value, and goes up."""
+    raised = set()
+
+    def look(robot: Robot) -> None:
+        raised.add(robot.agent.observing.graph.n_c)
+
+    Mission(scenario("busy"), 9000, check=look).play()
+    assert min(raised) == scenario("busy").config.graph.n_c < max(raised)
+
+
+def test_robots_in_frames_of_their_own_hold_the_maps_of_all() -> None:
+    mission = Mission(scenario("frames"), 9000)
+    report = mission.run()
+    assert report.agreed
+    for robot in mission.honest:
+        components = robot.agent.consensus.folded.components
+        assert {id_.author for id_ in components} == {other.author for other in mission.honest}
+        assert {frame.author for frame in robot.agent.unplaced} >= {
+            other.author for other in mission.honest if other is not robot
+        }
+        assert 0 < len(robot.agent.map) < sum(len(c.nodes()[0].seed) for c in components.values())
 
 
 # Planted bugs: each is switched on alone, and the sweep must find it.
@@ -94,6 +120,17 @@ def unchecked_signature(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(transaction, "signature_holds", lambda key, signature, message: True)
 
 
+def boundless_n_c(patch: pytest.MonkeyPatch) -> None:
+    """The controller raises N_c beyond what others accept."""
+
+    def cut(self: Controller, over: float, done: object, affordable: bool) -> None:
+        self.n_c *= 2
+
+    patch.setattr(Controller, "_cut", cut)
+    # the graph would refuse it
+    patch.setattr(graph.AdjacencyDag, "n_c", graph.AdjacencyDag.n_c.setter(lambda self, n: None))
+
+
 def one_witness_too_many(patch: pytest.MonkeyPatch) -> None:
     """Every node counts one robot more than saw it."""
     verdict = fold.verdict_of
@@ -145,6 +182,7 @@ BUGS: dict[str, tuple[Plant, Callable[[], Scenario], str]] = {
     "lost retraction": (lost_retraction, lambda: scenario("loops"), "a retraction was lost"),
     "Lamport time": (unchecked_lamport, lambda: scenario("liars"), "a Lamport time is false"),
     "N_c": (one_child_too_many, lambda: scenario("wifi"), "E is wrong"),
+    "N_c max": (boundless_n_c, lambda: scenario("busy"), "N_c is too large"),
     "signature": (unchecked_signature, lambda: scenario("liars"), "a signature is false"),
     "witness": (one_witness_too_many, lambda: scenario("wifi"), "witnesses are miscounted"),
     "endless room": (endless_waiting_room, lambda: scenario("liars"), "memory"),

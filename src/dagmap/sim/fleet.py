@@ -47,7 +47,8 @@ Check: TypeAlias = Callable[[Robot], None]
 class Crash(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A robot's process dies at `at` (s) and is back `down` seconds later.
 
-    moment: "between" two steps; in the next step before the disk was synced; or after, "unsent".
+    moment: "between" two steps; "unsynced", in the next one that has something to store, before the
+    disk was synced; or "unsent", in the next one after that, before it has sent.
     """
 
     robot: str
@@ -242,7 +243,7 @@ class Fleet:
                 robot.transactions += 1
                 robot.issued += event.features
                 robot.issued_at.append((self.now, event.features))
-        if robot.doom == "unsynced":
+        if robot.doom == "unsynced" and robot.disk.unsynced:
             return self._die(robot, robot.doom)
         robot.disk.sync()
         if robot.doom == "unsent":

@@ -11,7 +11,7 @@ from ..agent import Agent
 from ..consensus import Consensus
 from ..graph import AdjacencyDag
 from ..identity import signature_holds
-from ..model import AuthorId, Int64s, State, TransactionId
+from ..model import AuthorId, Int64s, Issued, State, TransactionId
 from ..transaction import Transaction, signed_part
 from .fleet import Fleet
 from .robot import Happening, Observed, Robot
@@ -42,6 +42,7 @@ class _Looked:
     agent: Agent
     events: int = 0
     held: int = 0  # transactions
+    n_c: int = 0  # the largest so far
     chains: dict[AuthorId, int] = field(default_factory=dict)
 
 
@@ -54,15 +55,15 @@ class Invariants:
     def __init__(self) -> None:
         self.fleet: Fleet | None = None
         self._looked: dict[str, _Looked] = {}
-        self._observed: set[str] = set()
+        self._grown: set[str] = set()  # robots whose graph may have changed
         self._signed: set[TransactionId] = set()
         self._robot = ""
         self._second = 0  # of simulated time
         self._busy: Counter[str] = Counter()  # events in it
 
     def saw(self, robot: Robot, happening: Happening) -> None:
-        if isinstance(happening, Observed):
-            self._observed.add(robot.name)
+        if isinstance(happening, Observed | Issued):
+            self._grown.add(robot.name)
 
     def __call__(self, robot: Robot) -> None:
         self._robot = robot.name
@@ -76,9 +77,12 @@ class Invariants:
         looked.events += 1
         self._bounds(robot.agent)
         self._ledger(robot.agent, looked)
-        if robot.name in self._observed:
-            self._observed.discard(robot.name)
-            self._graph(robot.agent.observing.graph, robot.agent.config.graph.n_c)
+        n_c = robot.agent.steering.controller.n_c  # what the graph is told to keep to
+        looked.n_c = max(looked.n_c, n_c)
+        self._require(n_c <= robot.agent.config.graph.n_c_max, "N_c is too large", f"{n_c}")
+        if robot.name in self._grown:
+            self._grown.discard(robot.name)
+            self._graph(robot.agent.observing.graph, n_c, looked.n_c)
         if looked.events % _EVERY == 0:
             self._map(robot.agent)
 
@@ -176,8 +180,11 @@ class Invariants:
             self._require(holds, "a signature is false", repr(tx))
             self._signed.add(tx.id)
 
-    def _graph(self, graph: AdjacencyDag, n_c: int) -> None:
-        """Acyclic, at most N_c children, E as it must be, validity the sum of the parents'."""
+    def _graph(self, graph: AdjacencyDag, n_c: int, largest: int) -> None:
+        """Acyclic, at most N_c children, E as it must be, validity the sum of the parents'.
+
+        n_c: now; largest: that it ever was, since what was inserted under it stays.
+        """
         parents, taken = graph.parents(), graph.parents_taken()
         ids, here = np.arange(len(graph)), graph.alive() | graph.issued()
         self._require(bool((parents < ids[:, None]).all()), "the graph has a cycle", "")
@@ -185,7 +192,7 @@ class Invariants:
         children = graph.children_count()
         self._require(bool((counted == children)[here].all()), "children are miscounted", "")
         self._require(
-            bool((children <= n_c).all()), "too many children", f"{children.max(initial=0)}"
+            bool((children <= largest).all()), "too many children", f"{children.max(initial=0)}"
         )
         terminals = np.flatnonzero(graph.alive() & (counted < n_c))
         self._require(np.array_equal(graph.terminals(), terminals), "E is wrong", "")

@@ -101,6 +101,23 @@ class WrongFrame(Honest):
         return replace(cycle, pose=wrong @ np.asarray(cycle.pose, np.float64), moved=moved)
 
 
+class Outsider(Honest):
+    """Reports true points, but from a place far behind it, so that walls lie in between.
+
+    Where it is the first that sees a place, what ends at those walls speaks against the place.
+    """
+
+    BACK = 4.5  # m
+
+    def cycle(self, cycle: Cycle, now: float) -> Cycle:
+        pose = np.array(cycle.pose, np.float64)
+        points = _points(cycle)
+        ahead = np.array([*pose[:2, 0], 0.0])
+        back = self.BACK * ahead / max(float(np.linalg.norm(ahead)), 1e-9)
+        pose[:3, 3] -= back
+        return replace(_with_points(cycle, points + back @ pose[:3, :3]), pose=pose, moved=None)
+
+
 class Forker(Honest):
     """Signs a second transaction with the same number and shows each half of the fleet one."""
 
@@ -131,6 +148,19 @@ class BackDater(Honest):
         while self._held and self._held[0][0] <= now:
             due.append(self._held.popleft()[1])
         return due
+
+
+class EarlyOutsider(BackDater):
+    """An outsider that refers to nobody, so that it is the first that sees a place."""
+
+    LATE = 0.0
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed)
+        self._outsider = Outsider(seed)
+
+    def cycle(self, cycle: Cycle, now: float) -> Cycle:
+        return self._outsider.cycle(cycle, now)
 
 
 class FalseDater(Honest):
@@ -270,6 +300,8 @@ LIARS: dict[str, type[Honest]] = {
     "eraser": Eraser,
     "splitter": Splitter,
     "wrong-frame": WrongFrame,
+    "outsider": Outsider,
+    "early-outsider": EarlyOutsider,
     "forker": Forker,
     "back-dater": BackDater,
     "false-dater": FalseDater,

@@ -16,7 +16,7 @@ from ..worldmap import WorldMap
 from .fleet import Check, Fleet
 from .liars import make_liar
 from .network import Network, Position
-from .robot import Happening, Recording, Restarted, Robot, Source, Timed
+from .robot import Costs, Happening, Recording, Restarted, Robot, Source, Timed
 from .scenario import Scenario
 from .scene import Scene, Walker
 from .truth import Lies, Quality, judge_lies, judge_quality
@@ -102,7 +102,14 @@ class Mission:
         if not self._recordings:
             self._scene = self._build_scene()
         network = Network(scenario.link, seed, self.scenario.partitions, self._where)
-        self.fleet = Fleet(scenario.config, network, self._note, check=check, tick=scenario.tick)
+        self.fleet = Fleet(
+            scenario.config,
+            network,
+            self._note,
+            check=check,
+            tick=scenario.tick,
+            costs=scenario.costs if scenario.costs != Costs() else None,
+        )
         self._network = network
         self._divergence: list[tuple[float, float]] = []
         self._cause = self._effect = 0.0  # s: last honest news or return, and last word of any
