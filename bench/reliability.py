@@ -36,7 +36,7 @@ from reliability_text import write
 ROOT = Path(__file__).parents[1]
 LONG = ("hundred", "hour")  # scenarios that are runs of their own, not part of the sweep
 LOSSES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
-KINDS = ("forger", "eraser", "splitter", "wrong-frame")
+KINDS = ("forger", "eraser", "splitter", "wrong-frame", "outsider", "early-outsider")
 FLEET = 8  # robots in the runs with loss and in those with liars
 A, B = TypeVar("A"), TypeVar("B")
 Tell = Callable[[str, float], None]  # (what is measured, share done)

@@ -22,18 +22,23 @@ many keys as it likes, and no bound holds. Let m robots lie, together and in any
 2. **Nothing invented is confirmed while m < w.** A node is `confirmed` only with w different
    authors, and only its own key can speak for an author. With m = w liars that say the same it
    is confirmed: the tests show it.
-3. **A place stays while more honest robots saw it than speak against it, liars included.** Each
-   author counts at most once for and once against a node, and it is rejected only where those
-   against are at least as many. So a node that h honest robots saw and a honest ones speak
-   against survives m liars where h > a + m; with nobody honest against it, m + 1 witnesses are
-   enough (m at least 1). One liar more can reject it, where nothing around it speaks for it: the
-   tests show that too, with the evidence of the neighbourhood switched off (`doubt` = 1000);
-   with it, dense surfaces stay although they are outvoted.
+3. **A place stays while more honest robots saw it than speak against it, liars included, if an
+   honest robot saw it first.** Each author counts at most once for and once against a node, and it
+   is rejected only where those against are at least as many. So a node that began with an honest
+   observation, that h honest robots saw and a honest ones speak against, survives m liars where
+   h > a + m; with nobody honest against it, m + 1 witnesses are enough (m at least 1). One liar
+   more can reject it, where nothing around it speaks for it: the tests show that too, with the
+   evidence of the neighbourhood switched off (`doubt` = 1000); with it, dense surfaces stay
+   although they are outvoted.
 
-The third is a promise about nodes. A liar that dates back can plant seeds of its own within
-delta of a place, so that the observations of honest robots are shared out among several nodes
-(the `splitter`): then h counts for each of those, and the place is lost only where it fails for
-all of them. The table has what that gains: next to nothing, but not nothing."""
+The third is a promise about nodes, and *first* is first in canonical order, which a liar can be by
+dating back or by being there early. From where a node was seen first it is judged what lies before
+it: a liar that reports true points from a false pose (the `outsider`) makes honest robots' walls
+speak against a place that all of them saw. It can also plant seeds of its own within delta of a
+place, so that the observations of honest robots are shared out among several nodes (the
+`splitter`): then h counts for each of those. For such *usurped* places there is no bound, and with
+`doubt` = 1000 some are lost to one liar (the tests show it); by default what lies around them
+speaks for them, and the table has what liars gain: next to nothing, but not nothing."""
 
 
 TEXT = """\
@@ -85,9 +90,11 @@ lacks.
 
 {fleet} robots in one room, of which 0 to 4 lie: *forger* invents a wall, *eraser* shoots rays
 through what is there, *splitter* surrounds points with copies, *wrong-frame* is half a metre and
-ten degrees off. Sums over {liar_runs} seeds. *Lost*: points of honest robots that are in the map
+ten degrees off, *outsider* says that it stands 4.5 m further back, *early-outsider* dates back
+too. Sums over {liar_runs} seeds. *Lost*: points of honest robots that are in the map
 without the liars' transactions and rejected with them. *Proven lost*: of the nodes that so many
-liars' misses cannot outvote, those rejected: must be 0. *Confirmed*: nodes that no honest robot
+liars' misses cannot outvote, and that an honest robot saw first, those rejected: must be 0.
+*Usurped lost*: the same of those that a liar saw first. *Confirmed*: nodes that no honest robot
 saw, confirmed (in brackets: those far from every real surface): must be 0 while there are fewer
 liars than `witnesses`.
 
@@ -194,7 +201,7 @@ def _loss_row(row: dict[str, Any]) -> list[str]:
 
 
 def _liars(rows: list[dict[str, Any]]) -> str:
-    columns = ["liars", "how many", "lost of honest points", "proven lost"]
+    columns = ["liars", "how many", "lost of honest points", "proven lost", "usurped lost"]
     columns += [f"confirmed, `witnesses` = {row}" for row in (2, 3)]
     by = {(row["witnesses"], row["kind"], row["liars"]): row for row in rows}
     return _table(
@@ -204,7 +211,11 @@ def _liars(rows: list[dict[str, Any]]) -> str:
                 kind,
                 str(liars),
                 f"{by[2, kind, liars]['honest_lost']:,} of {by[2, kind, liars]['honest_points']:,}",
-                f"{by[2, kind, liars]['proven_lost']:,} of {by[2, kind, liars]['proven_nodes']:,}",
+                *(
+                    f"{by[2, kind, liars][f'{which}_lost']:,} of "
+                    f"{by[2, kind, liars][f'{which}_nodes']:,}"
+                    for which in ("proven", "usurped")
+                ),
                 *(_confirmed(by[witnesses, kind, liars]) for witnesses in (2, 3)),
             ]
             for _, kind, liars in (key for key in by if key[0] == 2)

@@ -122,6 +122,14 @@ class DefaultFold:
         said = rays.judge(say, nodes.seed[:n], nodes.origin, nodes.first, nodes.entries)
         return weighing.Evidence(*(plain(c) for c in said.T), *(plain(c) for c in around.T))
 
+    def first_authors(self) -> Int32s:
+        """(N,) index of the author whose observation each node began with."""
+        nodes, n = self._nodes, len(self)
+        oldest = nodes.first[:n].copy()
+        while n and (older := nodes.entries[oldest, matching.NEXT]).max() >= 0:
+            oldest = np.where(older >= 0, older, oldest)
+        return plain(nodes.entries[oldest, matching.AUTHOR])
+
     @property
     def nbytes(self) -> int:
         return self._features.nbytes + sum(array.nbytes for array in self._nodes)

@@ -12,6 +12,7 @@ import numpy as np
 from ..agent import Agent
 from ..consensus import Consensus
 from ..contribution import Author
+from ..fold import DefaultFold
 from ..metrics import nearest, thin
 from ..model import AuthorId, Bools, FrameId, Int32s, State
 from ..transaction import Transaction
@@ -39,8 +40,11 @@ class Lies(msgspec.Struct, frozen=True, kw_only=True):
     liars: int
     honest_points: int  # features of honest robots that are in the map without the liars
     honest_lost: int  # of these, rejected with the liars
-    proven_nodes: int  # more honest robots saw them than liars and honest ones can speak against
+    proven_nodes: int  # more honest robots saw them than liars and honest ones can speak against,
+    # and all that these saw of them is in nodes that began with an honest observation
     proven_lost: int  # of these, no observation is in a node that is kept: must be 0
+    usurped_nodes: int  # the same with a liar's observation first, from whose pose they are judged
+    usurped_lost: int  # of these, likewise: may be more than 0
     liars_only: int  # nodes that no honest robot saw
     liars_confirmed: int  # of these, confirmed: must be 0 where `witnesses` exceeds the liars
     false_confirmed: int  # confirmed nodes that no honest robot saw, far from every surface
@@ -97,12 +101,17 @@ def judge_lies(
     survives[was[~(states[now] == State.REJECTED)]] = True
     seen = np.zeros(len(before.states), np.bool_)
     seen[was] = True
+    usurped = np.zeros(len(before.states), np.bool_)
+    usurped[was[~_began_with(robot.agent.consensus, origin, good)[now]]] = True
+    gone = proven & seen & ~survives
     return Lies(
         liars=liars,
         honest_points=int(kept.sum()),
         honest_lost=int(lost.sum()),
-        proven_nodes=int(proven.sum()),
-        proven_lost=int((proven & seen & ~survives).sum()),
+        proven_nodes=int((proven & ~usurped).sum()),
+        proven_lost=int((gone & ~usurped).sum()),
+        usurped_nodes=int((proven & usurped).sum()),
+        usurped_lost=int((gone & usurped).sum()),
         liars_only=int((~truly).sum()),
         liars_confirmed=int(confirmed.sum()),
         false_confirmed=int((confirmed & far).sum()),
@@ -135,6 +144,14 @@ def _seen_by(fold: Consensus, origin: FrameId, good: set[AuthorId], count: int) 
         nodes = fold.folded.feature_nodes(origin, author.index)
         seen[nodes[nodes >= 0]] = True
     return seen
+
+
+def _began_with(fold: Consensus, origin: FrameId, good: set[AuthorId]) -> Bools:
+    """Nodes that began with an observation of one of these authors."""
+    found = fold.folded.components[origin].fold
+    if not isinstance(found, DefaultFold):  # Algorithm 2 judges nothing from there
+        return np.ones(len(found), np.bool_)
+    return np.isin(found.first_authors(), [author.index for author in _authors(fold, good)])
 
 
 def _pairs(
