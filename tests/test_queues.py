@@ -41,18 +41,22 @@ class TestInbox:
         assert inbox.take(0).messages == []
 
     def test_one_sender_cannot_crowd_out_another(self) -> None:
-        inbox = Inbox(10_000, 4_000)
+        inbox = Inbox(10 * (1_000 + Inbox.HELD), 4 * (1_000 + Inbox.HELD))
         taken = [inbox.put_message(message(1_000, YOU)) for _ in range(6)]
         assert taken == [True] * 4 + [False] * 2
         assert inbox.put_message(message(1_000, ME))
         assert inbox.dropped == 2
 
     def test_all_senders_together_are_bounded(self) -> None:
-        inbox = Inbox(10_000, 4_000)
+        inbox = Inbox(10 * (1_000 + Inbox.HELD), 4 * (1_000 + Inbox.HELD))
         taken = [inbox.put_message(message(1_000, bytes([i]) * 8)) for i in range(12)]
         assert sum(taken) == 10 and inbox.dropped == 2
         assert len(inbox.take(0).messages) == 10
         assert inbox.put_message(message(1_000))  # what was taken has made room
+
+    def test_the_smallest_messages_are_bounded_too(self) -> None:
+        inbox = Inbox(100 * Inbox.HELD, 100 * Inbox.HELD)
+        assert sum(inbox.put_message(b"") for _ in range(1000)) == 100
 
     def test_a_message_too_short_to_name_its_sender(self) -> None:
         inbox = Inbox(1_000, 1_000)

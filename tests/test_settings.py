@@ -73,7 +73,7 @@ class TestMistakes:
     @pytest.mark.parametrize(
         ("text", "message"),
         [
-            ("", "missing required field `store`"),
+            ("", r"there is no table \[store\]; add one with path ="),
             ("[store]\n", "missing required field `path` - at `$.store`"),
             (STORE + "[network]\nlisen = []", "unknown field `lisen` - at `$.network`"),
             (STORE + '[network]\nlisten = ["7447"]', "listen = .*, but endpoints such as"),

@@ -57,6 +57,10 @@ class AgentCommand:
         """0: stopped, or agreed. Raises DagmapError."""
         if not self.speed > 0:
             raise DagmapError(f"--speed {self.speed}: more than 0 is wanted; 1 is as recorded")
+        if self.wait_for < 0:
+            raise DagmapError(f"--wait-for {self.wait_for}: a number of robots is wanted")
+        if self.until_agreed is not None and not self.until_agreed >= 0:
+            raise DagmapError(f"--until-agreed {self.until_agreed}: seconds, 0 or more, are wanted")
         settings = self._settings()
         load_zenoh()
         source = self._open_source(settings)

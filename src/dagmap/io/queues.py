@@ -98,10 +98,12 @@ class Inbox:
     """What comes in for the agent: messages, cycles, questions. Any thread puts, one takes.
 
     most, most_of_one: bytes of messages that wait, in all and of one sender (as the message names
-        it: a hint, so the first bound is what holds against liars). What exceeds them is dropped.
+        it: a hint, so the first bound is what holds against liars), and HELD more for each. What
+        exceeds them is dropped.
     rates: how fast messages may come; what comes faster is dropped, too.
     """
 
+    HELD = 64  # bytes of memory that a message takes beside its own
     MESSAGES = 16  # taken at once, so that a cycle never waits behind many
 
     def __init__(
@@ -123,18 +125,23 @@ class Inbox:
 
     def put_message(self, data: bytes) -> bool:
         """Keep a message, or drop it where it would exceed a bound."""
-        sender = sender_of(data)
+        sender, size = sender_of(data), len(data) + self.HELD
         with self._change:
-            full = self._size + len(data) > self._most
-            full = full or self._size_of[sender] + len(data) > self._most_of_one
+            full = self._size + size > self._most
+            full = full or self._size_of[sender] + size > self._most_of_one
             if full or not self._throttle.lets(sender, data):
                 self.dropped += 1
                 return False
-            self._size += len(data)
-            self._size_of[sender] += len(data)
+            self._size += size
+            self._size_of[sender] += size
             self._messages.append(data)
             self._change.notify_all()
             return True
+
+    def drop(self) -> None:
+        """Count a message that never came this far."""
+        with self._change:
+            self.dropped += 1
 
     @property
     def unread(self) -> bool:
@@ -165,9 +172,9 @@ class Inbox:
             work, self._work = self._work, Work()
             while self._messages and len(work.messages) < self.MESSAGES:
                 data = self._messages.popleft()
-                sender = sender_of(data)
-                self._size -= len(data)
-                self._size_of[sender] -= len(data)
+                sender, size = sender_of(data), len(data) + self.HELD
+                self._size -= size
+                self._size_of[sender] -= size
                 if not self._size_of[sender]:
                     del self._size_of[sender]
                 work.messages.append(data)

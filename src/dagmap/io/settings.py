@@ -200,7 +200,13 @@ def load_settings(path: Path) -> Settings:
 
     Raises ConfigError that names the file, the key and what is wanted.
     """
-    config = load_config(path, AgentConfig)
+    try:
+        config = load_config(path, AgentConfig)
+    except ConfigError as error:
+        if "required field `store`" in str(error):
+            remedy = 'add one with path = "data/ledger.db"'
+            raise ConfigError(f"{path}: there is no table [store]; {remedy}") from None
+        raise
     if not config.name and not config.closed:
         try:
             config = msgspec.structs.replace(config, name=path.stem)
