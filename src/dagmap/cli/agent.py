@@ -154,7 +154,8 @@ class AgentCommand:
         stack.callback(checkpoint.write, agent)  # closes before the store does
         stack.enter_context(StatusServer(settings.control, inbox))
         if (address := config.metrics.address) is not None:
-            stack.enter_context(MetricsServer(address, runtime, transport))
+            askers = config.metrics.askers
+            stack.enter_context(MetricsServer(address, runtime, transport, askers))
         _log_start(log, agent, settings)
         return runtime, transport
 
@@ -178,8 +179,10 @@ def _inbox(config: AgentConfig) -> Inbox:
         network.receive_messages_per_second_per_robot,
         network.receive_bytes_per_second_per_robot,
         config.sync.chunk_bytes,
+        network.senders_remembered,
     )
-    return Inbox(network.receive_bytes, network.receive_bytes_per_robot, rates)
+    most, of_one = network.receive_bytes, network.receive_bytes_per_robot
+    return Inbox(most, of_one, rates, at_once=network.messages_per_step)
 
 
 def _report(transport: Transport, runtime: Runtime) -> dict[str, object]:

@@ -13,7 +13,6 @@ from .closing import Closing
 from .runtime import Runtime
 from .transport import Transport
 
-_ASKERS = 16  # at one time: each has a thread for as long as it may be silent
 _TYPE = "text/plain; version=0.0.4; charset=utf-8"
 Sample = tuple[dict[str, str], float]
 
@@ -94,8 +93,14 @@ class _Server(ThreadingHTTPServer):
 class MetricsServer(Closing):
     """Serves the metrics on a thread of its own."""
 
-    def __init__(self, address: tuple[str, int], runtime: Runtime, transport: Transport) -> None:
-        """Raises NetworkError where the address cannot be listened on."""
+    def __init__(
+        self,
+        address: tuple[str, int],
+        runtime: Runtime,
+        transport: Transport,
+        askers: int = 16,
+    ) -> None:
+        """askers: served at a time. Raises NetworkError where the address cannot be listened on."""
 
         class Handler(BaseHTTPRequestHandler):
             timeout = 10
@@ -115,7 +120,7 @@ class MetricsServer(Closing):
                 """The log is for the fleet, not for whoever reads its numbers."""
 
         try:
-            self._server = _Server(address, Handler, _ASKERS)
+            self._server = _Server(address, Handler, askers)
         except OSError as error:
             raise NetworkError(
                 f"metrics.listen: {address[0]}:{address[1]} cannot be listened on "

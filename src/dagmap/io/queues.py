@@ -43,6 +43,7 @@ class Rates:
     messages_of_one: float = math.inf
     bytes_of_one: float = math.inf
     question: int = 0  # bytes that a question counts for: those of the answer that it may cause
+    senders: int = 256  # that are remembered; whoever is forgotten begins anew
 
 
 @dataclass(slots=True)
@@ -67,8 +68,6 @@ class Throttle:
     those of one keep an honest robot that has gone wrong from crowding out the others.
     """
 
-    SENDERS = 256  # that are remembered; whoever is forgotten begins anew
-
     def __init__(self, rates: Rates, clock: Callable[[], float]) -> None:
         self._rates, self._clock = rates, clock
         self._all = _Bucket(rates.messages, math.inf, clock())
@@ -82,7 +81,7 @@ class Throttle:
             sender, _Bucket(rates.messages_of_one, rates.bytes_of_one, now)
         )
         self._of_one.move_to_end(sender)
-        if len(self._of_one) > self.SENDERS:
+        if len(self._of_one) > rates.senders:
             self._of_one.popitem(last=False)
         self._all.fill(rates.messages, math.inf, now)
         one.fill(rates.messages_of_one, rates.bytes_of_one, now)
@@ -101,10 +100,10 @@ class Inbox:
         it: a hint, so the first bound is what holds against liars), and HELD more for each. What
         exceeds them is dropped.
     rates: how fast messages may come; what comes faster is dropped, too.
+    at_once: messages that are taken at a time, so that a cycle never waits behind many.
     """
 
     HELD = 64  # bytes of memory that a message takes beside its own
-    MESSAGES = 16  # taken at once, so that a cycle never waits behind many
 
     def __init__(
         self,
@@ -112,7 +111,9 @@ class Inbox:
         most_of_one: int,
         rates: Rates | None = None,
         clock: Callable[[], float] = time.monotonic,
+        at_once: int = 16,
     ) -> None:
+        self._at_once = at_once
         self._most, self._most_of_one = most, most_of_one
         self._throttle = Throttle(rates or Rates(), clock)
         self._change = threading.Condition()
@@ -170,7 +171,7 @@ class Inbox:
         with self._change:
             self._change.wait_for(self._something, max(0.0, patience))
             work, self._work = self._work, Work()
-            while self._messages and len(work.messages) < self.MESSAGES:
+            while self._messages and len(work.messages) < self._at_once:
                 data = self._messages.popleft()
                 sender, size = sender_of(data), len(data) + self.HELD
                 self._size -= size

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 _SEND_BUFFER = 65_536  # bytes in the kernel: what waits there can no longer be dropped or overtaken
 _RETRY = {"period_init_ms": 250, "period_max_ms": 2000, "period_increase_factor": 2.0}
 _LARGEST = 65_536  # bytes that Zenoh puts together of what comes in: a message, its key and more
-_ROBOTS = 4096  # whose presence is remembered: anybody in reach can claim to be many
 
 
 class Traffic:
@@ -73,6 +72,7 @@ class Transport(Closing):
         """Open the session. Raises NetworkError that names the endpoint or the missing extra."""
         self._zenoh = load_zenoh()
         self._me, self._inbox = me, inbox
+        self._most_robots = network.robots_remembered
         self._prefix = f"dagmap/{fleet_id.hex()}"
         self._here: set[AuthorId] = set()
         self._queue = SendQueue(network.send_bytes)
@@ -148,7 +148,11 @@ class Transport(Closing):
             return
         if sample.kind == self._zenoh.SampleKind.DELETE:
             self._here = self._here - {author}
-        elif len(author) == len(self._me) and author != self._me and len(self._here) < _ROBOTS:
+        elif (
+            len(author) == len(self._me)
+            and author != self._me
+            and len(self._here) < self._most_robots
+        ):
             self._here = self._here | {author}
 
     def _publish(self) -> None:
