@@ -184,6 +184,18 @@ def euroc(list_of_right: bytes) -> bytes:
     return pack((files | {b"mav0/cam1/data.csv": list_of_right}).items())
 
 
+def kitti(row: bytes, mounted: bytes = b"Tr: " + b"1e200 " * 12) -> bytes:
+    files = dict(files_of(next(iter(targets.load("scans").seeds()))))
+    return pack((files | {b"poses.txt": 2 * row, b"calib.txt": mounted}).items())
+
+
+def colmap(name: bytes) -> bytes:
+    """A picture that lies too far away."""
+    seeds = (dict(files_of(data)) for data in targets.load("colmap").seeds())
+    far = next(f for f in seeds if np.float64(1e9).tobytes() in f.get(b"images.bin", b""))
+    return pack((far | {b"images.bin": far[b"images.bin"].replace(b"a.png", name)}).items())
+
+
 def ascii_cloud(*lines: str) -> bytes:
     fields = "".join(f"property float {name}\n" for name in ("x", "y", "z", "state"))
     head = f"ply\nformat ascii 1.0\nelement vertex {len(lines)}\n{fields}end_header\n"
@@ -242,6 +254,9 @@ FOUND |= {
     "a hidden cloud": ("scans", lambda: pack([(b".pcd", b""), (b"poses.txt", TUM)])),
     "a scan too sparse for odometry": ("scans", lambda: pack([(b"0.bin", bytes(range(1, 33)))])),
     "a picture's name with a zero": ("euroc", lambda: euroc(b"1000000000,\0.png\n")),
+    "a pose whose product overflows": ("scans", lambda: kitti(b"1e200 " * 11 + b"1\n")),
+    "a line of one comma": ("scans", lambda: kitti(b"1 " * 12 + b"\n", mounted=b",\n")),
+    "a picture's name of two lines": ("colmap", lambda: colmap(b"a\nb")),
     "a place that is no number": ("rtabmap", lambda: b"UPDATE Feature SET depth_x = x'ff'"),
 }
 LEDGERS = {

@@ -242,4 +242,5 @@ def _picture(where: str, name: str, numbers: list[float], seen: npt.NDArray[np.u
     pose = matrix(np.array(place), np.array([x, y, z, w]))
     if pose is None:
         raise RecordingError(f"{where}: the rotation is no unit quaternion; export the model anew")
-    return _Picture(name, inverse(pose), seen[seen != _NO_POINT])
+    shown = "".join(c if c.isprintable() else "?" for c in name)  # it stands in errors
+    return _Picture(shown, inverse(pose), seen[seen != _NO_POINT])
