@@ -47,7 +47,8 @@ def _parse(data: bytes) -> tuple[Floats, Uint8s | None]:
         rows = _compressed(data, at, kind, count)
     else:
         raise ValueError(f"its data is {form[:20]!r}")
-    points = np.stack([rows[axis].astype(np.float64).reshape(count) for axis in "xyz"], axis=1)
+    with np.errstate(invalid="ignore"):  # some programs write NaNs that signal
+        points = np.stack([rows[axis].astype(np.float64).reshape(count) for axis in "xyz"], axis=1)
     color = next((name for name in ("rgb", "rgba") if name in names), None)
     if color is None or kind[color].itemsize != 4:
         return points, None

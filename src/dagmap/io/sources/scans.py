@@ -223,12 +223,14 @@ def _read_bin(path: Path) -> tuple[Floats, Uint8s | None]:
             "reflectance, float32); it is cut short or of another format"
         )
     rows = np.frombuffer(data, "<f4").reshape(-1, _WHOLE_KITTI)
-    return rows[:, :3].astype(np.float64), None
+    with np.errstate(invalid="ignore"):  # some programs write NaNs that signal
+        return rows[:, :3].astype(np.float64), None
 
 
 def _read_ply(path: Path) -> tuple[Floats, Uint8s | None]:
     rows = read_vertices(path, tuple("xyz"), "copy or write it anew", _FITS)
-    points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    with np.errstate(invalid="ignore"):
+        points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
     if not set(_COLORS) <= set(rows.dtype.names or ()):
         return points, None
     return points, np.stack([rows[name].astype(np.uint8) for name in _COLORS], axis=1)
