@@ -23,6 +23,8 @@ ALL = (
     "figure_11",
     "section_5",
     "completion",
+    "sensors",
+    "feature_poor",
     "figure_10",
     "agreement",
     "figure_07",

@@ -42,7 +42,7 @@ def environment(port: int) -> dict[str, str]:
         "ROS_MASTER_URI": f"http://127.0.0.1:{port}",
         "ROS_IP": "127.0.0.1",
         "ROS_HOSTNAME": "127.0.0.1",
-        "ROS_LOG_DIR": os.path.join(tempfile.gettempdir(), "dagmap-ros-log"),
+        "ROS_HOME": os.path.join(tempfile.gettempdir(), "dagmap-tests-ros"),
     }
 
 

@@ -231,6 +231,15 @@ class TestSessions:
         )
         assert [cycle.session for cycle in found] == [0, 1]
 
+    def test_nodes_that_are_numbered_anew_are_a_new_session(self) -> None:
+        """As where RTAB-Map starts again with an empty database."""
+        first, again = self.follow(
+            data(5.0, [node(1, 5.0, np.eye(4), self.one)], {1: np.eye(4)}),
+            data(1.0, [node(1, 1.0, moved(9.0), self.one)], {1: moved(9.0)}),
+        )
+        assert (first.session, again.session, again.stamp) == (0, 1, 1.0)
+        assert again.moved is None and np.allclose(again.pose, moved(9.0))
+
     def test_a_map_that_moves_as_a_whole_has_not_moved(self) -> None:
         """As where RTAB-Map optimises from the newest node, or joins an older map."""
         poses = {1: moved(1.0), 2: moved(2.0)}

@@ -22,12 +22,15 @@ from .contribution import Author, Contribution, Key, Placement
 from .folded import TRANSACTION, Copying, Folded, Picture, frame_bytes
 from .frames import IDENTITY_POSE, place_frames, rough
 from .kernels.geometry import apply_pose
-from .model import AuthorId, Bools, FrameId, Int32s
+from .model import FLEET_FRAME, AuthorId, Bools, FrameId, Int32s
 from .payload import Anchor
 from .transaction import Transaction
 
 MAX_SESSIONS = 256  # of one author that others look for; its features count in any case
-MAX_LINKS = 256  # of one author, the first in its chain: bounds what placing frames costs
+# What placing frames costs is bounded by the links that count: of one author to frames of one
+# other, the first in its chain, so that whoever shows a robot ever new frames uses up the room for
+# its own frames only; and to frames of so many authors.
+MAX_LINKS, MAX_LINKED = 64, 1024
 
 
 class _Cut(NamedTuple):
@@ -68,6 +71,7 @@ class Consensus:
         self._stale: set[Key] = set()  # to be placed (again) before they are applied
         self._gone: list[Contribution] = []  # cut; their rays are still to be taken back
         self._links_changed = False
+        self._linked: set[AuthorId] = set()  # authors to whose frames a link leads, or once led
         self._upwards = False  # the revision undoes no more
         self._late: list[Transaction | _Cut] = []  # waits for the end of a revision
         self._copying: Copying | None = None
@@ -301,22 +305,23 @@ class Consensus:
         for anchor in tx.payload.anchors:
             known = author.anchors.get(anchor.cycle)
             author.anchors[anchor.cycle] = anchor
-            if len(author.sessions) < MAX_SESSIONS:
+            if anchor.session not in author.sessions and len(author.sessions) < MAX_SESSIONS:
                 author.sessions.add(anchor.session)
+                self._links_changed |= author.id in self._linked
             if known is None or not _same(known, anchor):
                 self._restale(author.seen_in.get(anchor.cycle, ()))
         self._restale(author.retract(tx.payload.retracted))
         for link in tx.payload.links:
-            ends = (link.source, link.target)
-            room = ends in author.links or len(author.links) < MAX_LINKS
-            if link.source.author == tx.author and room:  # a robot places its own frames only
-                author.links[ends] = link
+            # a robot places its own frames only
+            if link.source.author == tx.author and author.take_link(link, MAX_LINKS, MAX_LINKED):
+                self._linked.add(link.target.author)
                 self._links_changed = True
         author.name = author.name if tx.payload.robot is None else tx.payload.robot
 
     def _update_frames(self) -> None:
         before = self.frames
-        links = [link for author in self.authors.values() for link in author.links.values()]
+        every = (link for author in self.authors.values() for link in author.links.values())
+        links = [link for link in every if self._exists(link.target)]
         self.frames, self._links_changed = place_frames(links), False
         firm = [link for link in links if not rough(link)]
         self.firm = self.frames if len(firm) == len(links) else place_frames(firm)
@@ -328,6 +333,11 @@ class Consensus:
                 anchor = author.anchors.get(cycle)
                 if anchor is not None and FrameId(author.id, anchor.session) in moved:
                     self._restale(keys)
+
+    def _exists(self, frame: FrameId) -> bool:
+        """Whether a frame is the fleet's or its author has seen anything in it."""
+        author = self.authors.get(frame.author)
+        return frame == FLEET_FRAME or (author is not None and frame.session in author.sessions)
 
     def _apply(self, contribution: Contribution) -> None:
         folded = self.folded

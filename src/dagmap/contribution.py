@@ -6,6 +6,7 @@ positions in the sensor's frame are decoded again from the transaction's bytes.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeAlias
@@ -40,6 +41,18 @@ class Author:
     keys: list[Key] = field(default_factory=list)  # of the same contributions
     seen_in: dict[int, list[Key]] = field(default_factory=dict)  # contributions by cycle
     sessions: set[int] = field(default_factory=set)  # of its anchors, the first ones
+    linked: Counter[AuthorId] = field(default_factory=Counter)  # links to frames of each author
+
+    def take_link(self, link: Link, most: int, authors: int) -> bool:
+        """Take a link in the place of an older one between its frames; or as a new one, where
+        fewer than `most` lead to its target's author, and to fewer others than `authors`."""
+        ends, to = (link.source, link.target), link.target.author
+        if ends not in self.links:
+            if self.linked[to] >= most or (to not in self.linked and len(self.linked) >= authors):
+                return False
+            self.linked[to] += 1
+        self.links[ends] = link
+        return True
 
     def retract(self, numbers: Int64s) -> list[Key]:
         """Mark features (ascending numbers) as withdrawn; the contributions that held them."""

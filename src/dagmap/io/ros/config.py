@@ -58,7 +58,7 @@ class RosConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True)
     publish_period: float = 2.0  # s between two maps
     tf_period: float = 0.1  # s between two transforms
     max_nodes: int = 500_000  # of a map that is told; of more it is thinned evenly
-    max_edges: int = 5_000  # the newest ones
+    max_edges: int = 2_000  # the newest ones
     patience: float = 1.0  # s that a cloud waits for its pose
     max_features: int = 1000  # points that a cloud or a node gives at most
     max_depth: float | None = None  # m, points beyond are dropped

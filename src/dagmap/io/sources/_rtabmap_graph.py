@@ -21,7 +21,8 @@ class GraphFollower:
 
     Poses are told in the frame of the session's first node: RTAB-Map may optimise from another
     node, or join an older map, and then moves its map frame as a whole. A graph that shares no
-    node with the one before is a new session. skip: is told what was left out.
+    node with the one before is a new session, and so is one whose nodes were numbered anew.
+    skip: is told what was left out.
     """
 
     def __init__(self, options: Options, skip: Callable[[str], None]) -> None:
@@ -35,6 +36,9 @@ class GraphFollower:
 
     def data(self, message: Any) -> list[Cycle]:
         """The nodes of a MapData that are new, and what has moved. Raises Unusable."""
+        stamps = {int(node.id): float(node.stamp) for node in message.nodes}
+        if any(self._stamps.get(id_, stamp) != stamp for id_, stamp in stamps.items()):
+            self._begin_anew()
         poses = self._enter(message.graph)
         moved = self._moved(poses)
         found = []
@@ -57,9 +61,12 @@ class GraphFollower:
             first = min(known)
             self.map = self._told[first] @ inverse(poses[first])
         elif poses and self._told:
-            self._told, self._stamps, self._last = {}, {}, -np.inf
-            self.session, self.map = self.session + 1, np.eye(4)
+            self._begin_anew()
         return poses
+
+    def _begin_anew(self) -> None:
+        self._told, self._stamps, self._last = {}, {}, -np.inf
+        self.session, self.map = self.session + 1, np.eye(4)
 
     def _moved(self, poses: dict[int, Floats]) -> dict[float, Floats]:
         """New poses by stamp, of nodes that were told elsewhere."""
