@@ -6,10 +6,12 @@
 #   make test         make check, then the test suite
 #   make check        ruff, mypy, import-linter
 #   make bench        measure the speed (dagmap bench)
+#   make figures      the paper's figures and what was measured beside them, in out/figures; minutes
 #   make sweep        thousands of simulated missions with faults and liars, SEEDS=2000 for more, and
 #                     a real robot killed 200 times, KILLS=2000 for more
 #   make reliability  all figures and plots of docs/reliability.md; hours
 #   make fuzz         fuzz all that reads foreign bytes, 10^6 executions (RUNS=...); Linux, Python 3.11 on
+#   make docs         build the site into out/site
 #   make lock         renew requirements/*.txt after a change of dependencies in pyproject.toml
 #   make clean-cache  forget compiled kernels
 #   make clean        remove all that the above have made
@@ -37,7 +39,7 @@ OFFICE := examples/office/robot1 examples/office/robot2 examples/office/robot3
 # A sourced ROS workspace sets PYTHONPATH; its packages must not mix with those of the environments.
 unexport PYTHONPATH
 
-.PHONY: demo fleet test check bench sweep reliability fuzz lock clean clean-cache
+.PHONY: demo fleet test check bench figures sweep reliability fuzz docs lock clean clean-cache
 .DELETE_ON_ERROR:
 
 demo: $(DEMO)/.package
@@ -61,6 +63,9 @@ check: $(TEST)/.package
 bench: $(TEST)/.package
 	@$(TEST)/bin/dagmap bench
 
+figures: $(TEST)/.package
+	@$(TEST)/bin/python experiments/all.py --out out/figures
+
 sweep: $(TEST)/.package
 	@$(TEST)/bin/dagmap simulate $(SWEPT) --seeds $(SEEDS)
 	DAGMAP_KILLS=$(KILLS) $(TEST)/bin/python -m pytest -q tests/test_fleet_crash.py::TestKill
@@ -71,6 +76,9 @@ reliability: $(TEST)/.package
 RUNS ?= 1000000
 fuzz: $(TEST)/.fuzz
 	$(TEST)/bin/python fuzz/run.py all --runs $(RUNS)
+
+docs: $(TEST)/.docs
+	NO_MKDOCS_2_WARNING=1 $(TEST)/bin/python -m mkdocs build --strict --quiet
 
 # The demo installs a copy as a user would; the tests see the sources themselves.
 $(DEMO)/.package: $(DEMO)/.requirements pyproject.toml $(shell find src/dagmap -name '*.py')
@@ -95,6 +103,10 @@ $(TEST)/.fuzz: requirements/fuzz.txt $(TEST)/.package
 	@$(TEST)/bin/python $(PIP) --require-hashes -r $<
 	@touch $@
 
+$(TEST)/.docs: requirements/docs.txt $(TEST)/.package
+	@$(TEST)/bin/python $(PIP) --require-hashes -r $<
+	@touch $@
+
 # Debian and Ubuntu may have pip but not ensurepip: then the pip outside puts one into the environment.
 $(DEMO)/bin/python $(TEST)/bin/python $(LOCK)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] < (3, 14))' || { \
@@ -109,6 +121,7 @@ lock: $(LOCK)/bin/uv
 	  --output-file requirements/demo.txt
 	$(COMPILE) --extra dev --constraint requirements/demo.txt --output-file requirements/test.txt
 	$(COMPILE) --extra fuzz --constraint requirements/test.txt --output-file requirements/fuzz.txt
+	$(COMPILE) --extra docs --constraint requirements/test.txt --output-file requirements/docs.txt
 	@! grep -n '://' requirements/*.txt || { echo "An address in a lock file, see above" >&2; exit 1; }
 
 $(LOCK)/bin/uv: | $(LOCK)/bin/python
@@ -116,9 +129,9 @@ $(LOCK)/bin/uv: | $(LOCK)/bin/python
 
 # numba notices a change in a kernel's own file, not in one that it calls from another file.
 clean-cache:
-	find src bench fuzz tests $(wildcard $(DEMO)) \( -name '*.nbi' -o -name '*.nbc' \) -delete
+	find src bench experiments fuzz tests $(wildcard $(DEMO)) \( -name '*.nbi' -o -name '*.nbc' \) -delete
 
 clean: clean-cache
 	rm -rf $(DEMO) $(TEST) $(LOCK) out build dist .hypothesis .import_linter_cache .mypy_cache \
 	  .pytest_cache .ruff_cache .benchmarks
-	find src bench fuzz tests -name __pycache__ -prune -exec rm -rf {} +
+	find src bench experiments fuzz tests -name __pycache__ -prune -exec rm -rf {} +

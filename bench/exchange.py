@@ -34,14 +34,15 @@ def bundle(author: int, points: npt.NDArray[np.int32]) -> Block | None:
         base=0,
         xyz=dag.positions(rows),
         alive=np.ones(n, np.bool_),
-        cycle=np.zeros(n, np.int32),
+        starts=np.array([0, n], np.int64),
+        cycle=np.zeros(1, np.int32),
         color=np.zeros((n, 3), np.uint8),
-        colored=np.zeros(n, np.bool_),
+        colored=np.zeros(1, np.bool_),
         parents=np.where(parents >= 0, numbers[parents], -1),
         cores=np.array([n - 1], np.int64),
         sightings=np.zeros(0, np.int64),
         sighting_cycle=np.zeros(0, np.int32),
-        origin=np.zeros((n, 3), np.int32),
+        origin=np.zeros((1, 3), np.int32),
     )
 
 

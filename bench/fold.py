@@ -112,14 +112,15 @@ def _block(
         base=number * POINTS,
         xyz=points,
         alive=np.ones(n, np.bool_),
-        cycle=np.full(n, number, np.int32),
+        starts=np.array([0, n], np.int64),
+        cycle=np.full(1, number, np.int32),
         color=rng.integers(0, 256, (n, 3), dtype=np.uint8),
-        colored=np.ones(n, np.bool_),
+        colored=np.ones(1, np.bool_),
         parents=None,
         cores=np.zeros(0, np.int64),
         sightings=np.zeros(0, np.int64),
         sighting_cycle=np.zeros(0, np.int32),
-        origin=np.tile(origin.astype(np.int32), (n, 1)),
+        origin=origin.astype(np.int32).reshape(1, 3),
     )
 
 

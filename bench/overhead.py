@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -88,10 +88,15 @@ def fly(most: int, n_c: int, others: int = 1) -> list[Seen]:
     return seen
 
 
-def predicted(flights: dict[tuple[int, int], list[Seen]], learn: Callable[..., bool]) -> list[Row]:
+def predicted(
+    flights: dict[tuple[int, int], list[Seen]],
+    learn: Callable[..., bool],
+    further: Sequence[int] = (),
+) -> list[Row]:
     """A row for decades of n(U) of each flight (N_c, N_G), and what both models make of it.
 
     learn: whether a cycle (n(U), N_c, N_G) is one that the models are fitted to.
+    further: n(U) beyond a single flight, for which there is a prediction only.
     """
     models = {as_printed: Model(as_printed) for as_printed in (True, False)}
     for (n_c, n_g), seen in flights.items():
@@ -107,14 +112,22 @@ def predicted(flights: dict[tuple[int, int], list[Seen]], learn: Callable[..., b
             around = [each.seconds for each in seen[max(0, i - 4) : i + 5]]
             row = {"n_u": size.n_u, "n_c": n_c, "n_g": n_g, "learnt": learn(size.n_u, n_c, n_g)}
             row["measured_ms"] = 1e3 * float(np.median(around))
-            row["own_ms"] = 1e3 * models[True].own(work)
-            row["paper_printed_ms"] = 1e3 * models[True].paper(work, size)
-            row["paper_meant_ms"] = 1e3 * models[False].paper(work, size)
-            rows.append(row)
+            rows.append(row | _by_models(models, work, size))
+    for n_u in further:
+        row = {"n_u": n_u, "n_c": n_c, "n_g": n_g, "learnt": False, "measured_ms": None}
+        rows.append(row | _by_models(models, work, Size(n_u, n_c)))
     found = models[True]
     rows[0] |= {"l_dist_ns": 1e9 * found.l_dist, "l_search_ns": 1e9 * found.l_search}
     rows[0] |= dict(zip(("insert_us", "send_us", "merge_us"), 1e6 * found.costs, strict=True))
     return rows
+
+
+def _by_models(models: dict[bool, Model], work: Work, size: Size) -> Row:
+    return {
+        "own_ms": 1e3 * models[True].own(work),
+        "paper_printed_ms": 1e3 * models[True].paper(work, size),
+        "paper_meant_ms": 1e3 * models[False].paper(work, size),
+    }
 
 
 def completion(n_c: int, v_th: int, count: int = 40) -> Row:
@@ -158,17 +171,23 @@ def steering(period: float = 1.0, ticks: int = 20, count: int = 300) -> Row:
     return {"name": "steering", "ms_a_cycle": 1e3 * spent, "share_of_a_1_s_cycle": spent / period}
 
 
+def measure(most: int, further: Sequence[int] = ()) -> dict[str, list[Row]]:
+    """Cycles against n(U), N_c and N_G; see `predicted`."""
+    fly(4000, 2)  # compiled and warm
+    degrees = {(n_c, 2): fly(min(most, 10_000), n_c) for n_c in (2, 3, 4, 6, 8)}
+    fleets = {(2, 1 + n): fly(min(most, 4_000), 2, n) for n in (1, 3, 7, 15, 31)}
+    return {
+        "n_u": predicted({(2, 2): fly(most, 2)}, lambda n_u, n_c, n_g: n_u <= LEARNT, further),
+        "n_c": predicted(degrees, lambda n_u, n_c, n_g: n_c <= 3),
+        "n_g": predicted(fleets, lambda n_u, n_c, n_g: n_g <= 4),
+    }
+
+
 def run(most: int | None = None) -> list[Row]:
     """Rows. n(U) goes up to 10^6, or to DAGMAP_BENCH_MOST (10^7 takes minutes and 3 GB)."""
     most = most or int(os.environ.get("DAGMAP_BENCH_MOST", "1000000"))
-    fly(4000, 2)  # compiled and warm
-    sizes = predicted({(2, 2): fly(most, 2)}, lambda n_u, n_c, n_g: n_u <= LEARNT)
-    degrees = {(n_c, 2): fly(min(most, 10_000), n_c) for n_c in (2, 3, 4, 6, 8)}
-    fleets = {(2, 1 + n): fly(4_000, 2, n) for n in (1, 3, 7, 15, 31)}
-    by_degree = predicted(degrees, lambda n_u, n_c, n_g: n_c <= 3)
-    by_fleet = predicted(fleets, lambda n_u, n_c, n_g: n_g <= 4)
-    mapped = [completion(n_c, v_th) for v_th in WANTED for n_c in (2, 4, 8)]
-    found = {"n_u": sizes, "n_c": by_degree, "n_g": by_fleet, "completion": mapped}
+    found = measure(most)
+    found["completion"] = [completion(n_c, v_th) for v_th in WANTED for n_c in (2, 4, 8)]
     rows = [{"name": f"against {name}", **row} for name, part in found.items() for row in part]
     OUT.mkdir(parents=True, exist_ok=True)
     (OUT / "overhead.json").write_text(json.dumps(found, indent=1) + "\n")
@@ -184,24 +203,8 @@ def draw(found: dict[str, list[Row]], path: Path) -> None:
         return
     figure = Figure(figsize=(9, 6.5), layout="constrained")
     axes = figure.subplots(2, 2)
-    lines = {
-        "measured_ms": ("measured", "black", "o-"),
-        "own_ms": ("a cost per feature", "#2166d1", "--"),
-        "paper_printed_ms": ("Eq. (2) to (5) as printed", "#d7301f", "--"),
-        "paper_meant_ms": ("with 2^(2 log n) in Eq. (5)", "#e08214", ":"),
-    }
-    titles = {"n_u": "n(U) of a robot", "n_c": "N_c", "n_g": "N_G, robots"}
-    for axis, (key, title) in zip(axes.flat, titles.items(), strict=False):
-        for column, (name, color, style) in lines.items():
-            rows = found[key]
-            x, y = [row[key] for row in rows], [row[column] for row in rows]
-            axis.plot(x, y, style, color=color, label=name, markersize=3)
-        axis.set_yscale("log" if key == "n_u" else "linear")
-        axis.set_xscale("log" if key == "n_u" else "linear")
-        if key != "n_u":
-            axis.set_ylim(bottom=0)
-        axis.set_title(f"S of a cycle of {FEATURES} features, ms")
-        axis.set_xlabel(title)
+    for axis, key in zip(axes.flat, ("n_u", "n_c", "n_g"), strict=False):
+        draw_costs(axis, key, found[key])
     axes[0, 0].legend()
     for v_th in WANTED:
         rows = [row for row in found["completion"] if row["v_th"] == v_th]
@@ -212,3 +215,23 @@ def draw(found: dict[str, list[Row]], path: Path) -> None:
     axes[1, 1].set_ylim(bottom=0)
     axes[1, 1].legend()
     figure.savefig(path, dpi=100)
+
+
+def draw_costs(axis: Any, key: str, rows: list[Row]) -> None:
+    """S of a cycle against n_u, n_c or n_g: measured, and as the models predict it."""
+    lines = {
+        "measured_ms": ("measured", "black", "o-"),
+        "own_ms": ("a cost per feature", "#2166d1", "--"),
+        "paper_printed_ms": ("Eq. (2) to (5) as printed", "#d7301f", "--"),
+        "paper_meant_ms": ("with 2^(2 log n) in Eq. (5)", "#e08214", ":"),
+    }
+    for column, (name, color, style) in lines.items():
+        pairs = [(row[key], row[column]) for row in rows if row[column] is not None]
+        axis.plot(*zip(*pairs, strict=True), style, color=color, label=name, markersize=3)
+    if key == "n_u":
+        axis.set_xscale("log")
+        axis.set_yscale("log")
+    else:
+        axis.set_ylim(bottom=0)
+    axis.set_title(f"S of a cycle of {FEATURES} features, ms")
+    axis.set_xlabel({"n_u": "n(U) of a robot", "n_c": "N_c", "n_g": "N_G, robots"}[key])

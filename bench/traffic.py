@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,9 @@ import msgspec
 import numpy as np
 
 from dagmap import Config, Cycle, GraphConfig
+from dagmap.cli.replay import traffic_figure
 from dagmap.config import IssuanceConfig
-from dagmap.io.figures import RobotTraffic, TrafficFigure, draw_traffic
+from dagmap.io.figures import draw_traffic
 from dagmap.io.sources import open_source
 from dagmap.model import OutputError
 from dagmap.sim.fleet import Fleet
@@ -56,21 +58,24 @@ def _one(cycles: list[Cycle]) -> Cycle:
     return Cycle(last.stamp, last.pose, np.concatenate(points))
 
 
-def office() -> list[Robot]:
+def office(most: int | None = None) -> list[Robot]:
+    """Three robots in the office. most: cycles of each recording; None: all."""
     issuance = IssuanceConfig(cycle_period=0.6 * TOGETHER)
     fleet = Fleet(msgspec.structs.replace(Config(), issuance=issuance))
-    recordings = {f"robot{i}": joined(open_source(OFFICE / f"robot{i}")) for i in (1, 2, 3)}
+    sources = {f"robot{i}": open_source(OFFICE / f"robot{i}") for i in (1, 2, 3)}
+    recordings = {name: joined(islice(source, most)) for name, source in sources.items()}
     for _ in fleet.run(recordings):
         pass
     return list(fleet.robots.values())
 
 
-def hour(seconds: float) -> list[Robot]:
+def hour(seconds: float, points: int = 400) -> list[Robot]:
+    """Three robots of so many points in a cycle of 5 s."""
     config = Config(
         graph=GraphConfig(reference_pitch=0.25, max_parent_distance=0.75),
         issuance=IssuanceConfig(cycle_period=5.0),
     )
-    sensor = SensorConfig(points=400, period=5.0)
+    sensor = SensorConfig(points=points, period=5.0)
     scenario = Scenario(
         name="an hour", robots=3, seconds=seconds, tick=0.25, config=config, sensor=sensor
     )
@@ -81,7 +86,12 @@ def hour(seconds: float) -> list[Robot]:
 
 def measure(name: str, robots: list[Robot]) -> list[Row]:
     """Peaks and means over seconds from the first cycle to the last."""
-    draw_all(name, robots)
+    draw_all(OUT / f"{name}.png", robots)
+    return rows(name, robots)
+
+
+def rows(name: str, robots: list[Robot]) -> list[Row]:
+    """A row a robot, and one of all."""
     return [_row(name, [robot]) for robot in robots] + [_row(name, robots)]
 
 
@@ -98,9 +108,9 @@ def _row(name: str, robots: list[Robot]) -> Row:
         "features_with": int(with_it.sum()),
         "peak_without": int(without.max()),
         "peak_with": int(with_it.max()),
-        "peak_to_mean_without": ratios[0],
-        "peak_to_mean_with": ratios[1],
-        "part": ratios[1] / ratios[0],
+        "peak_to_mean_without": float(ratios[0]),
+        "peak_to_mean_with": float(ratios[1]),
+        "part": float(ratios[1] / ratios[0]),
         "bytes": sum(robot.bytes_sent for robot in robots),
     }
 
@@ -110,20 +120,12 @@ def _bins(pairs: list[tuple[float, int]], span: int) -> np.ndarray:
     return np.bincount(at, [count for _, count in pairs], span)
 
 
-def draw_all(name: str, robots: list[Robot]) -> None:
-    OUT.mkdir(parents=True, exist_ok=True)
-    found = [
-        RobotTraffic(robot.name, *_columns(robot.issued_at), *_columns(robot.observed_at))
-        for robot in robots
-    ]
+def draw_all(path: Path, robots: list[Robot]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        draw_traffic(OUT / f"{name}.png", TrafficFigure(found))
-    except (ImportError, OutputError):
+        draw_traffic(path, traffic_figure(robots))
+    except OutputError:
         return
-
-
-def _columns(pairs: list[tuple[float, int]]) -> tuple[Any, Any]:
-    return np.array([at for at, _ in pairs]), np.array([count for _, count in pairs], np.int64)
 
 
 def run(seconds: float | None = None) -> list[Row]:

@@ -37,9 +37,15 @@ LIMITS = (
 
 SHARES = {"message": 500, "ply": 160, "records": 130, "config": 110, "envelope": 40, "npz": 20}
 SHARES |= {"store": 12, "tum": 16, "columns": 8, "agent": 4, "closed": 40, "closed_agent": 4}
+SHARES |= {"colmap": 60, "orbslam": 60, "scans": 40, "euroc": 20, "rtabmap": 20}
 _PURE = ("kernels.codec", "kernels.rangecoder")
 _COMPILED = ("wire", "messages", "payload", "transaction", "config", "ledger", "sync", "agent")
 _COMPILED += ("io.sources._source", "io.sources._rgbd", "io.sources.npz", "io.sources.tum")
+_COMPILED += tuple(
+    f"io.sources.{name}"
+    for name in ("_cloud", "_pcd", "_poses", "_stereo", "_trajectory", "colmap", "euroc")
+)
+_COMPILED += ("io.sources.orbslam", "io.sources.rtabmap", "io.sources.scans")
 _COMPILED += (
     "io.export",
     "io.ply",

@@ -185,7 +185,7 @@ class Node:
         self.observations.append(points(block.xyz)[i])
         self.authors.add(block.author)
         self.seen[block.author] += 1
-        if block.colored[i]:
+        if block.colored[segment(block, i)]:
             self.colors.append(points(block.color)[i])
 
     def hit(self, author: int, cycle: int) -> None:
@@ -198,6 +198,11 @@ class Node:
         total = tuple(sum(o[k] for o in offsets) for k in range(3))
         color = tuple(sum(c[k] for c in self.colors) for k in range(3))
         return self.seed, total, len(self.observations), color, len(self.colors)  # type: ignore[return-value]
+
+
+def segment(block: Block, i: int) -> int:
+    """The segment of feature i."""
+    return max(k for k, start in enumerate(block.starts[:-1].tolist()) if start <= i)
 
 
 @dataclass
@@ -244,10 +249,10 @@ def naive_default(config: FoldConfig, blocks: Sequence[Block]) -> NaiveMap:
             near = fold.nearest(range(len(fold.nodes)), point) if fold.nodes else None
             if near is None or near[0] > config.delta_mm**2:
                 near = (0, len(fold.nodes))
-                fold.nodes.append(Node(point, origin=points(block.origin)[i]))
+                fold.nodes.append(Node(point, origin=points(block.origin)[segment(block, i)]))
             numbers[block.base + i] = near[1]
             fold.nodes[near[1]].observe(block, i)
-            fold.nodes[near[1]].hit(block.author, int(block.cycle[i]))
+            fold.nodes[near[1]].hit(block.author, int(block.cycle[segment(block, i)]))
         for number, cycle in zip(
             block.sightings.tolist(), block.sighting_cycle.tolist(), strict=True
         ):

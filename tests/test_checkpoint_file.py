@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import io
+import threading
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 
 import scene
 from dagmap import Agent
+from dagmap.io import checkpoint_file
 from dagmap.io.checkpoint_file import CheckpointFile, read_checkpoint
 from dagmap.io.log import Log
 from dagmap.io.store import Store
@@ -101,3 +105,31 @@ def test_trouble_with_it_is_logged_and_no_more(tmp_path: Path) -> None:
     with store:
         CheckpointFile(store, Log(said)).write(agent)
     assert "no checkpoint" in said.getvalue()
+
+
+def test_a_disk_that_is_slow_holds_up_nobody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    agent, store = mapped(tmp_path)
+    asked, freed = threading.Event(), threading.Event()
+    written = checkpoint_file.atomic_write
+
+    def slow(path: Path, mode: int) -> AbstractContextManager[BinaryIO]:
+        asked.set()
+        assert freed.wait(60)
+        return written(path, mode)
+
+    monkeypatch.setattr(checkpoint_file, "atomic_write", slow)
+    monkeypatch.setattr(checkpoint_file, "_PERIOD", 0.0)
+    with store:
+        kept = CheckpointFile(store, Log(io.StringIO()))
+        agent.settle()
+        kept.keep(agent)  # returns, although nothing is on the disk
+        assert asked.wait(60) and read_checkpoint(store) is None
+        go_on(agent, store, 6, session=1)
+        agent.settle()
+        kept.keep(agent)  # nor does a second one pile up behind the first
+        freed.set()
+        kept.write(agent)
+        again, judged = restored(agent, store, monkeypatch)
+        assert judged == 0 and again.digest() == agent.digest()

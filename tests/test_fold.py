@@ -53,22 +53,29 @@ def block(
     sightings: Any = (),
     origin: Any = None,
 ) -> Block:
-    """A block with plain columns; sightings are (number, cycle)."""
+    """A block with plain columns; sightings are (number, cycle); origin: one for each feature.
+
+    Neighbours with one origin that both have a colour, or both have none, are one segment.
+    """
     where = np.array(xyz, np.int32).reshape(-1, 3)
-    n = len(where)
+    n, colored = len(where), where[:, 0] % 3 != 0
+    origins = np.zeros_like(where) if origin is None else np.array(origin, np.int32)
+    new = (np.diff(origins, axis=0) != 0).any(axis=1) | (colored[1:] != colored[:-1])
+    heads = np.flatnonzero(np.concatenate([np.ones(min(n, 1), np.bool_), new]))
     return Block(
         author=author,
         base=base,
         xyz=where,
         alive=np.ones(n, np.bool_) if alive is None else np.array(alive, np.bool_),
-        cycle=np.full(n, cycle, np.int32),
+        starts=np.array([*heads, n], np.int64),
+        cycle=np.full(len(heads), cycle, np.int32),
         color=(where & 255).astype(np.uint8),
-        colored=where[:, 0] % 3 != 0,
+        colored=colored[heads],
         parents=None if parents is None else np.array(parents, np.int64),
         cores=np.array(cores, np.int64),
         sightings=np.array([s[0] for s in sightings], np.int64),
         sighting_cycle=np.array([s[1] for s in sightings], np.int32),
-        origin=np.zeros_like(where) if origin is None else np.array(origin, np.int32),
+        origin=origins[heads],
     )
 
 
@@ -99,7 +106,7 @@ def stories(draw: st.DrawFn, most: int = 8, size: int = 7) -> list[Block]:
             sightings=[(k, cycles[author] + int(rng.integers(-1, 2))) for k in again],
             origin=xyz // 2 + rng.integers(-2000, 2000, 3) * int(rng.integers(3)) // 2,
         )
-        made.cycle[:] = np.sort(cycles[author] + rng.integers(0, 2, n))
+        made.cycle[:] = np.sort(cycles[author] + rng.integers(0, 2, len(made.cycle)))
         numbers[author] = known if n else numbers[author]
         out.append(made)
     return out

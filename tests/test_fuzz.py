@@ -34,6 +34,7 @@ from dagmap.payload import Kind, encode_payload
 from dagmap.wire import Reader, Refusal
 from grammar import flipper, rest, tree
 from targets import _wire, tum
+from targets._folders import files_of, pack
 
 ROOT = Path(__file__).parents[1]
 NAMES = targets.names()
@@ -43,7 +44,12 @@ MUTATIONS = {
     "closed_agent": 150,
     "columns": 1500,
     "envelope": 1000,
+    "colmap": 1500,
+    "euroc": 300,
     "npz": 1500,
+    "orbslam": 1500,
+    "rtabmap": 400,
+    "scans": 800,
     "store": 300,
     "tum": 200,
 }  # of slow targets
@@ -141,7 +147,7 @@ def far_pose() -> bytes:
 
 
 def folder(**changed: bytes) -> bytes:
-    files = dict(tum._read(next(iter(tum.seeds()))))
+    files = dict(files_of(next(iter(tum.seeds()))))
     new = {name.replace("_", ".").encode(): data for name, data in changed.items()}
     return tum.pack((files | new).items())
 
@@ -168,6 +174,26 @@ def cloud(**changed: npt.NDArray[Any] | bytes) -> bytes:
             if isinstance(data, bytes):
                 archive.writestr(f"{name}.npy", data)
     return out.getvalue()
+
+
+TUM = b"1 0 0 0 0 0 0 1\n1.5 0 0 1 0 0 0 1\n"
+
+
+def euroc(list_of_right: bytes) -> bytes:
+    files = dict(files_of(next(iter(targets.load("euroc").seeds()))))
+    return pack((files | {b"mav0/cam1/data.csv": list_of_right}).items())
+
+
+def kitti(row: bytes, mounted: bytes = b"Tr: " + b"1e200 " * 12) -> bytes:
+    files = dict(files_of(next(iter(targets.load("scans").seeds()))))
+    return pack((files | {b"poses.txt": 2 * row, b"calib.txt": mounted}).items())
+
+
+def colmap(name: bytes) -> bytes:
+    """A picture that lies too far away."""
+    seeds = (dict(files_of(data)) for data in targets.load("colmap").seeds())
+    far = next(f for f in seeds if np.float64(1e9).tobytes() in f.get(b"images.bin", b""))
+    return pack((far | {b"images.bin": far[b"images.bin"].replace(b"a.png", name)}).items())
 
 
 def ascii_cloud(*lines: str) -> bytes:
@@ -223,6 +249,15 @@ FOUND: dict[str, tuple[str, Callable[[], bytes]]] = {
     "offsets that end early": ("ply", lambda: cloud(pose=POSE, offsets=np.array([0, 1]))),
     "a vertex whose state is infinite": ("ply", lambda: ascii_cloud("1 2 3 1e300")),
     "a vertex that is a comment": ("ply", lambda: ascii_cloud("# 1 2 3")),
+}
+FOUND |= {
+    "a hidden cloud": ("scans", lambda: pack([(b".pcd", b""), (b"poses.txt", TUM)])),
+    "a scan too sparse for odometry": ("scans", lambda: pack([(b"0.bin", bytes(range(1, 33)))])),
+    "a picture's name with a zero": ("euroc", lambda: euroc(b"1000000000,\0.png\n")),
+    "a pose whose product overflows": ("scans", lambda: kitti(b"1e200 " * 11 + b"1\n")),
+    "a line of one comma": ("scans", lambda: kitti(b"1 " * 12 + b"\n", mounted=b",\n")),
+    "a picture's name of two lines": ("colmap", lambda: colmap(b"a\nb")),
+    "a place that is no number": ("rtabmap", lambda: b"UPDATE Feature SET depth_x = x'ff'"),
 }
 LEDGERS = {
     "a ledger of no fleet": "DELETE FROM meta WHERE key = 'fleet'",

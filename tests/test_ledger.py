@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections import Counter
 
 import msgspec
 import numpy as np
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 
 from chains import CONFIG, Author, anchor, bundle
 from dagmap.config import LedgerConfig
+from dagmap.kernels.ascendants import count_children
 from dagmap.ledger import Ledger
 from dagmap.model import Reason
 from dagmap.payload import Payload, Sighting
@@ -118,6 +120,17 @@ def test_feature_numbers_follow_the_chain(payload: Payload) -> None:
     author = Author("a")
     first = author.make(features=3)
     assert refusal(author.make(payload=payload), first) is Reason.CHAIN
+
+
+@given(st.lists(st.lists(st.tuples(st.integers(-1, 5), st.integers(-1, 5)), max_size=6)))
+def test_children_are_counted_whole_or_not_at_all(story: list[list[tuple[int, int]]]) -> None:
+    children, counted = np.zeros(6, np.uint8), Counter[int]()
+    for rows in story:
+        after = counted + Counter(parent for row in rows for parent in row if parent >= 0)
+        fits = max(after.values(), default=0) <= 4
+        assert count_children(children, np.array(rows, np.int64).reshape(-1, 2), 4) == fits
+        counted = after if fits else counted
+        assert children.tolist() == [counted[k] for k in range(6)]
 
 
 def test_children_of_issued_features_are_counted_over_transactions() -> None:

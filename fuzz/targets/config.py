@@ -89,6 +89,10 @@ _WRONG = (
     b"chaos.crashes = 9999999999\n",
     b'store.path = "~nobody-at-all/x"\n',
     b'store.path = "a\\u0000b"\n',
+    b"store.path = 'a'\n[ros]\n[source]\npath = 'a'\n",
+    b"store.path = 'a'\nros.cloud = 'a b'\nros.zenoh.connect = ['x']\n",
+    b"store.path = 'a'\nros.zenoh = {namespace = 'a', listen = []}\n",
+    b"store.path = 'a'\nros = {map_data = '/m', map_graph = 'g', zenoh = {domain = 1}}\n",
 )
 
 
@@ -203,6 +207,7 @@ def _written(config: Config) -> bytes:
 PARSERS = {
     "dagmap.config": (),
     "dagmap.io.settings": ("SourceConfig.options",),
+    "dagmap.io.ros.config": (),
     "dagmap.sim.scenario": (),
     "dagmap.sim.building": ("!SceneConfig*",),
     "dagmap.sim.sensor": ("!SensorConfig*",),

@@ -7,24 +7,20 @@ import re
 import shutil
 import zlib
 from collections.abc import Iterable
-from pathlib import Path
 from random import Random
 
 import cv2
 import numpy as np
 
-from dagmap import wire
 from dagmap.io.sources import Options, tum
 from dagmap.model import DagmapError
-from dagmap.wire import Reader, Refusal
-from grammar import Flip, many, record, rest, sized, tree
-from grammar import mutate as mutate_tree
+from grammar import Flip
 from targets import Target
 from targets._files import workplace
+from targets._folders import change, pack, unpack
 
 _HOME = workplace()
 _NAME = re.compile(r"((rgb|depth)/)?[A-Za-z0-9._-]{1,60}\Z")
-_FILES = many(record(sized(rest), sized(rest)))
 _WORDS = (
     "0",
     "1",
@@ -65,7 +61,7 @@ def run(data: bytes) -> bool:
     folder = _HOME / "walk"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
-    _unpack(folder, data)
+    unpack(folder, data, _NAME)
     try:
         if not tum.matches(folder):
             return False
@@ -80,59 +76,9 @@ def run(data: bytes) -> bool:
     return True
 
 
-def _unpack(folder: Path, data: bytes) -> None:
-    """Names that lead out of the folder are left out."""
-    reader, made = Reader(data), 0
-    while reader.left and made < 16:
-        try:
-            name, body = reader.take(reader.number()), reader.take(reader.number())
-        except Refusal:
-            return
-        made += 1
-        text = name.decode("ascii", "replace")
-        path = folder / text
-        try:
-            if text.endswith("/") and _NAME.match(text[:-1]):
-                path.mkdir(parents=True, exist_ok=True)
-            elif _NAME.match(text):
-                path.parent.mkdir(exist_ok=True)
-                path.write_bytes(body)
-        except OSError:  # a file where a folder is wanted, or the other way round
-            continue
-
-
 def mutate(data: bytes, rng: Random, flip: Flip) -> bytes:
     """A word of a list becomes another; or files come, go, change names and bytes."""
-    if rng.random() < 0.4:
-        root = tree(data, _FILES)
-        mutate_tree(root, rng, flip)
-        return root.dump()
-    files = _read(data)
-    if not files:
-        return flip(data)
-    i = rng.randrange(len(files))
-    name, body = files[i]
-    words = re.split(rb"([ \n,:]+)", body)
-    if b"png" in name or b"jpg" in name or len(words) > 2000:
-        return pack([*files[:i], (name, flip(body)), *files[i + 1 :]])
-    j = rng.randrange(len(words))
-    words[j] = rng.choice((rng.choice(_WORDS).encode(), rng.choice(words), flip(words[j])))
-    return pack([*files[:i], (name, b"".join(words)), *files[i + 1 :]])
-
-
-def _read(data: bytes) -> list[tuple[bytes, bytes]]:
-    reader, files = Reader(data), []
-    try:
-        while reader.left:
-            files.append((reader.take(reader.number()), reader.take(reader.number())))
-    except Refusal:
-        pass
-    return files
-
-
-def pack(files: Iterable[tuple[bytes, bytes]]) -> bytes:
-    """Files as one input."""
-    return b"".join(wire.number(len(part)) + part for file in files for part in file)
+    return change(data, rng, flip, _WORDS)
 
 
 def seeds() -> Iterable[bytes]:

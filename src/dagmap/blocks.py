@@ -17,20 +17,24 @@ D = TypeVar("D", bound=np.generic)
 
 @dataclass(slots=True, eq=False)
 class Block:
-    """What one transaction contributes; positions are in the fleet frame already."""
+    """What one transaction contributes; positions are in the fleet frame already.
+
+    Features come in segments, each seen in one cycle: starts[k] to starts[k + 1] is the k-th.
+    """
 
     author: int  # local index: small, dense; no result depends on the numbering
     base: int  # feature i has the author's number base + i
     xyz: Int32s  # (n, 3) mm
     alive: Bools  # (n,) False: left out (withdrawn, unknown pose, out of range)
-    cycle: Int32s  # (n,) the author's cycle that saw the feature, 0 and up
+    starts: Int64s  # (k + 1,)
+    cycle: Int32s  # (k,) the author's cycle that saw the features, 0 and up
     color: Uint8s  # (n, 3)
-    colored: Bools  # (n,)
+    colored: Bools  # (k,)
     parents: Int64s | None  # (n, P) the author's numbers, -1 none; only Algorithm 2 needs them
-    cores: Int64s  # (k,) indices of the bundles' cores, in order; only Algorithm 2 needs them
+    cores: Int64s  # indices of the bundles' cores, in order; only Algorithm 2 needs them
     sightings: Int64s  # (s,) the author's numbers of features seen again: evidence only
     sighting_cycle: Int32s  # (s,)
-    origin: Int32s  # (n, 3) mm, where the sensor was that saw the feature
+    origin: Int32s  # (k, 3) mm, where the sensor was that saw the features
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -157,7 +157,7 @@ class LedgerConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     waiting_transactions: int = 4096  # the waiting room: transactions without their references
     waiting_bytes: int = 64 << 20
     # Observations whose folding can be undone after a checkpoint, at 4 bytes each. What comes from
-    # before them costs a fold of everything, half of which it would cost anyway.
+    # before them costs a fold of everything, which is less than undoing and applying everything.
     undo_kept: int = 1_000_000
     fold_per_tick: int = 25_000  # work of a tick, in features folded; a unit is about 1 us
 

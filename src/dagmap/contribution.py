@@ -9,15 +9,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TypeAlias, TypeVar
+from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from .config import Config
 from .fold import Block
 from .kernels.columns import grown
-from .kernels.geometry import apply_pose
+from .kernels.geometry import carry_segments
 from .model import AuthorId, Bools, FrameId, Int32s, Int64s
 from .payload import Anchor, Link, Sighting
 from .transaction import Transaction
@@ -25,7 +24,6 @@ from .transaction import Transaction
 Placement: TypeAlias = tuple[FrameId, Int32s]  # component, (7,) pose of a frame in it
 Frames: TypeAlias = Callable[[AuthorId, int], Placement]  # of an author's session
 Key: TypeAlias = tuple[int, AuthorId, int]  # the canonical order
-D = TypeVar("D", bound=np.generic)
 _NO_NUMBERS, _NO_CYCLES = np.zeros(0, np.int64), np.zeros(0, np.int32)
 
 
@@ -107,11 +105,12 @@ class Contribution:
         if bundle is None:
             self.base = 0
             self.xyz, self.color = np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8)
-            self.starts, self.cycles = np.zeros(1, np.int64), np.zeros(0, np.int64)
-            self.colored = np.zeros(0, np.uint8)
+            self.starts, self.cycles = np.zeros(1, np.int64), _NO_CYCLES
+            self.colored = np.zeros(0, np.bool_)
             return
         self.base, self.xyz, self.color = bundle.base, bundle.position, bundle.color
-        self.starts, self.cycles, self.colored = bundle.starts, bundle.cycles, bundle.colored
+        self.starts, self.cycles = bundle.starts, bundle.cycles.astype(np.int32)
+        self.colored = bundle.colored.astype(np.bool_)
         if paper:
             self.parents, self.cores = bundle.parents, bundle.cores()
 
@@ -130,30 +129,33 @@ class Contribution:
         return {*self.cycles.tolist(), *(sighting.cycle for sighting in self.sightings)}
 
     def place(self, frames: Frames, config: Config) -> None:
-        """Carry every feature from its sensor's frame into its component, in integers.
+        """Carry every feature from its sensor's frame into the component, in integers.
 
-        Left out is what was retracted, has no known anchor, or leaves +-2^29 mm on the way.
+        Left out is what was retracted, has no known anchor, leaves +-2^29 mm on the way, or lies
+        in another component than what comes first: honest transactions lie in one SLAM frame, and
+        a map for every feature would be a bomb.
         """
         position = self._positions(config)
+        homes = [self._home(cycle, frames) for cycle in self.cycles.tolist()]
+        again = [(sighting, self._home(sighting.cycle, frames)) for sighting in self.sightings]
+        known = [home for home in (*homes, *(home for _, home in again)) if home is not None]
+        component = known[0][1][0] if known else None
+        poses = np.zeros((len(homes), 2, 7), np.int32)
+        for s, home in enumerate(homes):
+            if home is not None and home[1][0] == component:
+                poses[s, 0], poses[s, 1] = home[0].pose, home[1][1]
         alive = np.ones(len(position), np.bool_)
         gone = self.author.retracted[self.base : self.base + len(position)]
-        alive[: len(gone)] &= ~gone
+        if len(gone):
+            alive[: len(gone)] &= ~gone
         self.xyz = np.zeros_like(position)
-        origins = np.zeros((len(self.cycles), 3), np.int32)
-        homes: list[FrameId | None] = []
-        for s, cycle in enumerate(self.cycles.tolist()):
-            rows = slice(int(self.starts[s]), int(self.starts[s + 1]))
-            home = self._home(cycle, frames)
-            known = next((h for h in homes if h is not None), None)
-            if home is None or (known is not None and home[1][0] != known):
-                alive[rows] = False
-                homes.append(None)
-                continue
-            anchor, (component, pose) = home
-            _through(anchor.pose, pose, position[rows], self.xyz[rows], alive[rows])
-            _through(anchor.pose, pose, np.zeros((1, 3), np.int32), origins[s : s + 1], None)
-            homes.append(component)
-        self.parts = self._split(homes, alive, origins, frames)
+        origins = np.zeros((len(homes), 3), np.int32)
+        carry_segments(poses, self.starts, position, self.xyz, origins, alive)
+        self.parts = []
+        if component is not None:
+            mask = None if bool(alive.all()) else alive
+            here = (sighting for sighting, home in again if home and home[1][0] == component)
+            self.parts = [Part(component, mask, origins, tuple(here))]
 
     def block(self, part: Part) -> Block:
         """The part in the form that a fold takes."""
@@ -167,18 +169,20 @@ class Contribution:
             base=self.base,
             xyz=self.xyz,
             alive=self.alive(part),
-            cycle=self._each(self.cycles.astype(np.int32)),
+            starts=self.starts,
+            cycle=self.cycles,
             color=self.color,
-            colored=self._each(self.colored.astype(np.bool_)),
+            colored=self.colored,
             parents=self.parents,
             cores=self.cores,
             sightings=numbers,
             sighting_cycle=cycles,
-            origin=part.origins.repeat(self.starts[1:] - self.starts[:-1], axis=0),
+            origin=part.origins,
         )
 
     def alive(self, part: Part) -> Bools:
-        return np.ones(len(self.xyz), np.bool_) if part.alive is None else part.alive
+        """(n,) which features count; not to be written to."""
+        return _all_true(len(self.xyz)) if part.alive is None else part.alive
 
     def _positions(self, config: Config) -> Int32s:
         if self.fresh:
@@ -191,38 +195,17 @@ class Contribution:
         anchor = self.author.anchors.get(cycle)
         return None if anchor is None else (anchor, frames(self.author.id, anchor.session))
 
-    def _split(
-        self, homes: list[FrameId | None], alive: Bools, origins: Int32s, frames: Frames
-    ) -> list[Part]:
-        """One part per component; nearly always there is one."""
-        again: dict[FrameId, list[Sighting]] = {}
-        for sighting in self.sightings:
-            home = self._home(sighting.cycle, frames)
-            if home is not None:
-                again.setdefault(home[1][0], []).append(sighting)
-        # Honest transactions lie in one SLAM frame; a map for every feature would be a bomb.
-        components = [*(home for home in homes if home is not None), *again][:1]
-        parts = []
-        for component in components:
-            mine = self._each(np.array([h == component for h in homes], np.bool_))
-            mine &= alive
-            mask = None if bool(mine.all()) else mine
-            parts.append(Part(component, mask, origins, tuple(again.get(component, ()))))
-        return parts
 
-    def _each(self, of_segments: npt.NDArray[D]) -> npt.NDArray[D]:
-        """A value of every segment for each of its features."""
-        starts = self.starts
-        if len(starts) == 2:  # what a robot says cycle by cycle
-            return np.full(len(self.xyz), of_segments[0])
-        return of_segments.repeat(starts[1:] - starts[:-1])
+class _Everyone:
+    """One array for all who ask for one that is all true."""
+
+    def __init__(self) -> None:
+        self._held = np.ones(1024, np.bool_)
+
+    def __call__(self, n: int) -> Bools:
+        if n > len(self._held):
+            self._held = np.ones(2 * n, np.bool_)
+        return self._held[:n]
 
 
-def _through(
-    anchor: Int32s, frame: Int32s, points: Int32s, out: Int32s, alive: Bools | None
-) -> None:
-    """Sensor to SLAM frame to component; `alive` is cleared where a point leaves the range."""
-    inside = np.ones(len(points), np.bool_) if alive is None else alive
-    between = np.empty_like(points)
-    apply_pose(anchor, points, between, inside)
-    apply_pose(frame, between, out, inside)
+_all_true = _Everyone()

@@ -150,6 +150,7 @@ def _seen(block: Block) -> matching.Seen:
     return matching.Seen(
         plain(block.xyz),
         plain(block.alive),
+        plain(block.starts),
         plain(block.cycle),
         plain(block.color),
         plain(block.colored),

@@ -20,6 +20,7 @@ import numpy as np
 
 from .config import Config
 from .identity import author_of
+from .kernels.ascendants import count_children
 from .model import AuthorId, Reason, TransactionId, Uint8s
 from .transaction import Transaction
 from .wire import Refusal
@@ -38,14 +39,15 @@ class Chain:
     @property
     def limit(self) -> int | None:
         """The number from which on nothing counts: the cut, or where the author was revoked."""
-        if self.cut is None or self.revoked is None:
+        if self.revoked is None or self.cut is None:
             return self.cut if self.revoked is None else self.revoked
         return min(self.cut, self.revoked)
 
     @property
     def end(self) -> int:
         """The first number that does not count: the chain's length, or the limit."""
-        return len(self.main) if self.limit is None else min(self.limit, len(self.main))
+        limit, length = self.limit, len(self.main)
+        return length if limit is None else min(limit, length)
 
 
 @dataclass(slots=True)
@@ -267,17 +269,7 @@ class Ledger:
             grown = np.zeros(max(end, 2 * len(chain.children)), np.uint8)
             grown[: len(chain.children)] = chain.children
             chain.children = grown
-        named = bundle.parents[bundle.parents >= 0]
-        if len(named) == 0:
-            return True
-        first = int(named.min())
-        gained = np.bincount(named - first)
-        before = chain.children[first : first + len(gained)]
-        total = before + gained
-        if total.max() > self.config.graph.n_c_max:
-            return False
-        before[:] = total
-        return True
+        return bool(count_children(chain.children, bundle.parents, self.config.graph.n_c_max))
 
     def _count_revocations(self, outcome: Outcome) -> None:
         """Judge anew who is revoked from where on, by what counts of the fleet key's chain."""

@@ -124,7 +124,7 @@ def thin(points: Floats, pitch: float = PITCH) -> Floats:
 
 def nearest(points: Floats, cloud: Floats) -> Floats:
     """(N,) m from each point to the nearest of a cloud that is not empty."""
-    return np.asarray(_tree(cloud).query(points)[0], np.float64)
+    return np.asarray(tree_of(cloud).query(points)[0], np.float64)
 
 
 def mean_map_entropy(points: Floats) -> float | None:
@@ -133,7 +133,7 @@ def mean_map_entropy(points: Floats) -> float | None:
     Mean over the points of ln |2 pi e S| / 2, S the covariance of what lies within 30 cm. No
     eigenvalue of S counts for less than a square millimetre.
     """
-    near = _tree(points).query_ball_point(points, _ENTROPY_RADIUS, return_sorted=True)
+    near = tree_of(points).query_ball_point(points, _ENTROPY_RADIUS, return_sorted=True)
     values = [
         np.linalg.eigvalsh(np.cov(points[index].T))
         for index in near
@@ -155,8 +155,8 @@ def double_walls(points: Floats, reference: Floats) -> float | None:
     """
     step = -(-len(points) // _PATCHES)
     centres = points[::step]
-    mine = _tree(points).query_ball_point(centres, _PATCH_RADIUS, return_sorted=True)
-    theirs = _tree(reference).query_ball_point(centres, _PATCH_RADIUS, return_sorted=True)
+    mine = tree_of(points).query_ball_point(centres, _PATCH_RADIUS, return_sorted=True)
+    theirs = tree_of(reference).query_ball_point(centres, _PATCH_RADIUS, return_sorted=True)
     judged = [
         _is_double(points[a], reference[b])
         for a, b in zip(mine, theirs, strict=True)
@@ -197,7 +197,7 @@ def _distances(found: Floats) -> Distances:
     return Distances(float(found.mean()), rmse, float(np.percentile(found, 95)))
 
 
-def _tree(points: Floats) -> Any:
+def tree_of(points: Floats) -> Any:
     try:
         from scipy.spatial import cKDTree
     except ImportError:

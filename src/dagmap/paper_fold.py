@@ -119,5 +119,8 @@ def _parents(block: Block) -> Int64s:
 
 def _graph_seen(block: Block) -> algorithm2.Seen:
     return algorithm2.Seen(
-        plain(block.xyz), plain(block.color), plain(block.colored), _parents(block)
+        plain(block.xyz),
+        plain(block.color),
+        block.colored.repeat(block.starts[1:] - block.starts[:-1]),
+        _parents(block),
     )

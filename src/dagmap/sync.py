@@ -11,6 +11,7 @@ import heapq
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from itertools import filterfalse
 from typing import NamedTuple
 
 from .config import Config
@@ -64,6 +65,7 @@ class Sync:
         self.peers: OrderedDict[AuthorId, Peer] = OrderedDict()
         self._next_announcement: float | None = None
         self._heads: dict[AuthorId, Head] = {}
+        self._ends: set[Head] = set()  # the same
         self._token = 0
         self._sent_at: OrderedDict[int, float] = OrderedDict()
         self._asked: OrderedDict[AuthorId, Asked] = OrderedDict()  # about whose chain
@@ -89,9 +91,9 @@ class Sync:
         if message.token != peer.token:
             peer.heads.clear()  # an announcement of several messages has one token
         peer.token, peer.heard = message.token, now
-        held, waiting = self._held(), self._ledger.waiting_from()
-        news = [head for head in message.heads if held.get(head[0]) != head]  # few, mostly
-        for head in news:
+        self._held()
+        waiting, held = self._ledger.waiting_from(), self._ends
+        for head in filterfalse(held.__contains__, message.heads):  # few are news, mostly
             if len(peer.heads) < _MAX_HEADS and self._promises(head, waiting):
                 peer.heads[head.author] = head
         for whose, token, kept in message.echoes:
@@ -192,7 +194,10 @@ class Sync:
         for author in sorted(self._ledger.changed):
             chain = self._ledger.chain(author)
             tip = _tip(chain.main[chain.end - 1].id if chain.end else b"")
-            self._heads[author] = Head(author, chain.end, tip, chain.cut)
+            head = Head(author, chain.end, tip, chain.cut)
+            self._ends.discard(self._heads.get(author, head))
+            self._ends.add(head)
+            self._heads[author] = head
         self._ledger.changed.clear()
         return self._heads
 

@@ -25,7 +25,7 @@ _Topic = Annotated[
 ]
 _Frame = Annotated[str | None, typer.Option(help="Of a bag with tf: the frame that stands still.")]
 _SameFrame = Annotated[bool, typer.Option(help="Poses are the sensor's, whatever frames say.")]
-_Poses = Annotated[Path | None, typer.Option(help="File of poses beside clouds: TUM or KITTI.")]
+_Poses = Annotated[Path | None, typer.Option(help="File of poses, TUM or KITTI (clouds, EuRoC).")]
 _Voxel = Annotated[float, typer.Option(help="Of a cloud one point a voxel is kept, m.")]
 _KeepGoing = Annotated[bool, typer.Option(help="Leave out what cannot be read.")]
 
@@ -113,6 +113,37 @@ def inspect(
         keep_going=keep_going,
     )  # fmt: skip
     raise typer.Exit(show_source(recording, options, json))
+
+
+@app.command()
+def tune(
+    recordings: Annotated[
+        list[Path], typer.Argument(help="One per robot; those of one fleet share a frame.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="TOML file to write; default: the terminal.")
+    ] = None,
+    camera: Annotated[Path | None, typer.Option(help="camera.json to use.")] = None,
+    max_features: Annotated[int, typer.Option(help="Points a frame gives at most.")] = 1000,
+    max_depth: _MaxDepth = None,
+    topic: _Topic = None,
+    frame: _Frame = None,
+    same_frame: _SameFrame = False,
+    poses: _Poses = None,
+    voxel: _Voxel = 0.1,
+    keep_going: _KeepGoing = False,
+    force: Annotated[bool, typer.Option(help="Replace the file.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Propose parameters from what recordings show of resolution and noise, without truth."""
+    from ..io.sources import Options
+    from .tune import Tune
+
+    options = Options(
+        camera, max_features, max_depth, tuple(topic or ()), frame, same_frame, poses, voxel,
+        keep_going,
+    )  # fmt: skip
+    Tune(recordings, out, options, force, json).run()
 
 
 @app.command()

@@ -6,13 +6,14 @@ import gc
 import json
 import signal
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from types import FrameType
 
+import msgspec
 from rich.console import Console
 from rich.progress import track
 
@@ -24,7 +25,11 @@ from ..io.metrics import MetricsServer
 from ..io.player import Player
 from ..io.queues import Inbox, Rates
 from ..io.revocations import Revocations
-from ..io.runtime import Runtime
+from ..io.ros.bridge import Bridge, Link
+from ..io.ros.config import RosConfig
+from ..io.ros.over_zenoh import ZenohLink
+from ..io.ros.types import Types
+from ..io.runtime import Runtime, Slam
 from ..io.settings import AgentConfig, Settings, load_settings
 from ..io.sources import Source, open_source
 from ..io.status import StatusServer, report
@@ -44,15 +49,23 @@ class AgentCommand:
     check: bool
     level: Level
     json: bool
+    link: Callable[[], Link] | None = None  # to ROS; None: over Zenoh, as the file says
+    ros: dict[str, object] = field(default_factory=dict)  # what is to replace keys of [ros]
     console: Console = field(default_factory=lambda: Console(stderr=True))
 
     def run(self) -> int:
         """0: stopped, or agreed. Raises DagmapError."""
         if not self.speed > 0:
             raise DagmapError(f"--speed {self.speed}: more than 0 is wanted; 1 is as recorded")
-        settings = load_settings(self.config_file)
+        if self.wait_for < 0:
+            raise DagmapError(f"--wait-for {self.wait_for}: a number of robots is wanted")
+        if self.until_agreed is not None and not self.until_agreed >= 0:
+            raise DagmapError(f"--until-agreed {self.until_agreed}: seconds, 0 or more, are wanted")
+        settings = self._settings()
         load_zenoh()
         source = self._open_source(settings)
+        if settings.config.ros is not None and self.link is None:
+            Types(ros2=True)  # says what is not installed
         warm_up(self.console)
         if self.check:
             self.console.print(f"{self.config_file}: all right")
@@ -66,25 +79,61 @@ class AgentCommand:
                 runtime.listen(settings.config.network.hear_first)
                 session = next_session(runtime.agent)
                 log.write("info", "mapping", session=session)
-                player = None
+                ready = partial(_enough, transport, self.wait_for)
+                slam: Slam | None = None
                 if source is not None:
-                    ready = partial(_enough, transport, self.wait_for)
                     player = Player(source, runtime.inbox, self.speed, session, ready)
                     player.start()
                     stack.callback(player.stop)
-                runtime.run(player, self.until_agreed)
+                    slam = player
+                elif settings.config.ros is not None:
+                    slam = self._bridge(settings.config.ros, runtime, log, session, ready, stack)
+                runtime.run(slam, self.until_agreed)
             runtime.agent.settle()
             answer = report(runtime, transport)
         log.write("info", "stopped", transactions=len(runtime.agent.ledger))
         sys.stdout.write(json.dumps(answer) + "\n" if self.json else _farewell(answer))
         return 0
 
+    def _settings(self) -> Settings:
+        """The file, with what a launch file says instead of it. Raises ConfigError."""
+        settings = load_settings(self.config_file)
+        if self.link is None:
+            return settings
+        try:
+            said = msgspec.to_builtins(settings.config.ros or RosConfig())
+            ros = msgspec.convert({**said, **self.ros}, RosConfig)
+        except msgspec.ValidationError as error:
+            raise ConfigError(f"parameters of the node: {error}") from None
+        config = msgspec.structs.replace(settings.config, ros=ros)
+        return Settings(config, settings.folder)
+
+    def _bridge(
+        self,
+        config: RosConfig,
+        runtime: Runtime,
+        log: Log,
+        session: int,
+        ready: Callable[[], bool],
+        stack: ExitStack,
+    ) -> Bridge:
+        """From and to the robot's ROS, as long as the stack."""
+        link = ZenohLink(config.zenoh) if self.link is None else self.link()
+        try:
+            bridge = Bridge(config, link, runtime.inbox, log, session, ready)
+        except BaseException:
+            link.close()
+            raise
+        stack.enter_context(bridge).start()
+        return bridge
+
     def _open_source(self, settings: Settings) -> Source | None:
         table = settings.config.source
         if table is None:
             return None
         camera = None if table.camera is None else settings.at(table.camera)
-        return open_source(settings.at(table.path), table.options(camera))
+        poses = None if table.poses is None else settings.at(table.poses)
+        return open_source(settings.at(table.path), table.options(camera, poses))
 
     def _assemble(
         self, settings: Settings, log: Log, stack: ExitStack
@@ -105,7 +154,8 @@ class AgentCommand:
         stack.callback(checkpoint.write, agent)  # closes before the store does
         stack.enter_context(StatusServer(settings.control, inbox))
         if (address := config.metrics.address) is not None:
-            stack.enter_context(MetricsServer(address, runtime, transport))
+            askers = config.metrics.askers
+            stack.enter_context(MetricsServer(address, runtime, transport, askers))
         _log_start(log, agent, settings)
         return runtime, transport
 
@@ -129,8 +179,10 @@ def _inbox(config: AgentConfig) -> Inbox:
         network.receive_messages_per_second_per_robot,
         network.receive_bytes_per_second_per_robot,
         config.sync.chunk_bytes,
+        network.senders_remembered,
     )
-    return Inbox(network.receive_bytes, network.receive_bytes_per_robot, rates)
+    most, of_one = network.receive_bytes, network.receive_bytes_per_robot
+    return Inbox(most, of_one, rates, at_once=network.messages_per_step)
 
 
 def _report(transport: Transport, runtime: Runtime) -> dict[str, object]:

@@ -41,6 +41,7 @@ def warm_graph_and_codec() -> None:
     """Compile what inserts features and what puts them on the wire."""
     from ..config import GraphConfig
     from ..graph import AdjacencyDag
+    from ..kernels.ascendants import count_children
     from ..kernels.codec import decode_features, encode_features, morton_order
     from ..registration import match
 
@@ -53,6 +54,7 @@ def warm_graph_and_codec() -> None:
     parents, color = np.full((12, 2), -1, np.int64), np.zeros((12, 3), np.uint8)
     data = encode_features(places, parents, 0, starts, color, one)
     decode_features(data, 12, 2, 0, starts, one)
+    count_children(one, parents, 1)
     match(np.zeros((2, 32), np.uint8), np.ones((2, 32), np.uint8))
 
 
@@ -60,28 +62,31 @@ def warm_fold() -> None:
     """Compile what folds features and walks their rays."""
     from ..config import FoldConfig
     from ..fold import Block, DefaultFold, RayEvidence
-    from ..kernels.geometry import apply_pose
+    from ..kernels.geometry import apply_pose, carry_segments
     from ..model import quantise_pose
 
     config, n = FoldConfig(), 12
     places, alive = np.full((n, 3), 500, np.int32), np.ones(n, np.bool_)
-    apply_pose(quantise_pose(np.eye(4)), places, places.copy(), alive)
+    starts, origins = np.array([0, n], np.int64), np.zeros((1, 3), np.int32)
+    still = quantise_pose(np.eye(4))
+    apply_pose(still, places, places.copy(), alive)
+    carry_segments(np.stack([still, still])[None], starts, places, places.copy(), origins, alive)
     block = Block(
         author=0,
         base=0,
         xyz=places,
         alive=alive,
-        cycle=np.zeros(n, np.int32),
+        starts=starts,
+        cycle=np.zeros(1, np.int32),
         color=np.zeros((n, 3), np.uint8),
-        colored=alive,
+        colored=np.ones(1, np.bool_),
         parents=None,
         cores=np.zeros(0, np.int64),
         sightings=np.zeros(1, np.int64),
         sighting_cycle=np.ones(1, np.int32),
-        origin=np.zeros((n, 3), np.int32),
+        origin=origins,
     )
     fold, rays = DefaultFold(config), RayEvidence(config.cell_mm, config.max_ray_mm)
-    starts, origins = np.array([0, n], np.int64), np.zeros((1, 3), np.int32)
     fold.apply(block)
     rays.walk(0, origins, starts, places, alive, 1)
     fold.evaluate(rays)

@@ -158,7 +158,7 @@ class Replay:
         for robot in robots:
             _write_graph(self.out / "graph" / f"{robot.name}.npz", robot)
         draw_maps(self.out / "maps.png", self._maps_figure(robots, world))
-        draw_traffic(self.out / "traffic.png", _traffic_figure(robots))
+        draw_traffic(self.out / "traffic.png", traffic_figure(robots))
         summary = {
             "converged": len(set(digests)) == 1,
             "digest": digests[0].hex(),
@@ -194,7 +194,7 @@ class Replay:
             points = np.concatenate([np.zeros((0, 3)), *track.points])
             features.append(points @ frame[:3, :3].T + frame[:3, 3])
             poses.append(np.array([frame @ pose for pose in track.poses]).reshape(-1, 4, 4))
-            layers.append(_layer(robot, frame, world))
+            layers.append(graph_layer(robot, frame, world))
         return MapsFigure(names, features, poses, layers, world)
 
     def _show(self, summary: dict[str, Any]) -> None:
@@ -267,7 +267,7 @@ def _write_graph(path: Path, robot: Robot) -> None:
     )
 
 
-def _layer(robot: Robot, frame: Floats, world: WorldMap) -> GraphLayer:
+def graph_layer(robot: Robot, frame: Floats, world: WorldMap) -> GraphLayer:
     """The robot's DAG in the fleet frame; merged are features that another robot saw too."""
     graph = robot.agent.observing.graph
     ids = np.flatnonzero(graph.alive())
@@ -281,7 +281,9 @@ def _layer(robot: Robot, frame: Floats, world: WorldMap) -> GraphLayer:
     return GraphLayer(ids, positions, graph.parents(ids), graph.issued(ids), merged)
 
 
-def _traffic_figure(robots: list[Robot]) -> TrafficFigure:
+def traffic_figure(robots: list[Robot]) -> TrafficFigure:
+    """What robots saw and sent, for `draw_traffic`."""
+
     def columns(pairs: list[tuple[float, int]]) -> tuple[Any, Any]:
         return (
             np.array([at for at, _ in pairs], np.float64),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from contextlib import suppress
 
@@ -23,22 +24,36 @@ class CheckpointFile:
         self._store, self._log = store, log
         self._held = 0  # transactions in the last one
         self._written = time.monotonic()
+        self._writer = threading.Thread()  # of the last one
         for part in self.path.parent.glob(".checkpoint.*.part"):  # of a process that was killed
             with suppress(OSError):
                 part.unlink()
 
     def keep(self, agent: Agent) -> None:
-        """Write it anew, where enough has come since the last one."""
+        """Begin to write it anew, where enough has come since the last one. Does not wait for the
+        disk: that takes many times as long as a cycle of the SLAM."""
         waited = time.monotonic() - self._written >= _PERIOD and agent.settled
-        if waited and len(agent.ledger) > _GROWTH * self._held:
-            self.write(agent)
+        if waited and len(agent.ledger) > _GROWTH * self._held and not self._writer.is_alive():
+            self._begin(agent)
 
     def write(self, agent: Agent) -> None:
         """Replace it by the agent's state. Trouble is logged: the ledger is what counts."""
+        if self._writer.ident is not None:
+            self._writer.join()
+        self._begin(agent)
+        self._writer.join()
+
+    def _begin(self, agent: Agent) -> None:
         self._written, self._held = time.monotonic(), len(agent.ledger)
+        state = agent.checkpoint(self._store.ids())
+        name = "dagmap checkpoint"
+        self._writer = threading.Thread(target=self._put, args=(state,), name=name)
+        self._writer.start()
+
+    def _put(self, state: bytes) -> None:
         try:
             with atomic_write(self.path, mode=0o600) as file:
-                file.write(agent.checkpoint(self._store.ids()))
+                file.write(state)
         except OutputError as error:
             self._log.write("warning", "no checkpoint", reason=error)
 

@@ -329,7 +329,7 @@ class Runtime:
         return bool(here) and all(who in peers and peers[who].heard > since for who in here)
 
     def _answer(self, question: Question) -> None:
-        question.answer = self._report(self)
+        question.answer = (question.look or self._report)(self)
         question.answered.set()
 
 

@@ -14,6 +14,7 @@ import msgspec
 
 from ..config import Config, _Checked, load_config
 from ..model import ConfigError
+from .ros.config import RosConfig
 from .sources import Options
 
 _MAX_FILE_NAME = 255  # bytes, of one part of a path
@@ -25,6 +26,7 @@ class SourceConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     path: str  # any recording that `dagmap inspect` knows
     max_features: int = 1000  # points that a frame of pictures gives at most
     camera: str | None = None  # a camera.json to use instead of the recording's own
+    poses: str | None = None  # a file of poses: TUM, or KITTI beside clouds
     max_depth: float | None = None  # m, points beyond are dropped
     topics: tuple[str, ...] = ()  # of a bag; what is not named is found by its type
     frame: str | None = None  # of a bag with tf: the frame that stands still
@@ -32,10 +34,11 @@ class SourceConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     voxel: float = 0.1  # m: of a cloud one point a voxel is kept
     keep_going: bool = False  # leave out what cannot be read
 
-    def options(self, camera: Path | None) -> Options:
+    def options(self, camera: Path | None, poses: Path | None = None) -> Options:
         """What the readers take. Raises ConfigError where one is out of its range."""
         return Options(
             camera=camera,
+            poses=poses,
             max_features=self.max_features,
             max_depth=self.max_depth,
             topics=self.topics,
@@ -76,6 +79,11 @@ class NetworkConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
     # From one robot, more than can be verified and folded (6 MB). A question counts for
     # `sync.chunk_bytes`: nobody makes a robot answer faster than that by asking and asking.
     receive_bytes_per_second_per_robot: int = 16 << 20
+    # Whoever reaches the network can claim to be many: senders whose rate is remembered (the
+    # oldest are forgotten), and robots in reach (nobody more is counted until somebody leaves).
+    senders_remembered: int = 256
+    robots_remembered: int = 4096
+    messages_per_step: int = 16  # a cycle of the SLAM never waits behind more
 
     def __post_init__(self) -> None:
         for name in ("send_bytes", "receive_bytes", "receive_bytes_per_robot"):
@@ -84,6 +92,8 @@ class NetworkConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
         self._require_range("receive_messages_per_second", 10, 1 << 32)
         self._require_range("receive_messages_per_second_per_robot", 10, 1 << 32)
         self._require_range("receive_bytes_per_second_per_robot", 1 << 16, 1 << 40)
+        for name in ("senders_remembered", "robots_remembered", "messages_per_step"):
+            self._require_range(name, 1, 1 << 20)
         self._require(
             self.mode != "client" or bool(self.connect) or self.scouting,
             "mode",
@@ -112,8 +122,10 @@ class MetricsConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Numbers for Prometheus under http://LISTEN/metrics; off unless an address is given."""
 
     listen: str | None = None  # "127.0.0.1:9464"; anybody who reaches the address can read it
+    askers: int = 16  # at a time: each has a thread for as long as it may be silent, 10 s
 
     def __post_init__(self) -> None:
+        self._require_range("askers", 1, 1 << 10)
         if self.listen is not None:
             host, _, port = self.listen.rpartition(":")
             right = bool(host) and port.isdecimal() and int(port) < 1 << 16
@@ -139,12 +151,15 @@ class AgentConfig(Config, frozen=True, kw_only=True, forbid_unknown_fields=True)
     store: StoreConfig
     keys: str = "."  # in a closed fleet: the folder that `dagmap keys enroll` made
     source: SourceConfig | None = None
+    ros: RosConfig | None = None  # a SLAM that runs, instead of a recording
     network: NetworkConfig = NetworkConfig()
     metrics: MetricsConfig = MetricsConfig()
     control: ControlConfig = ControlConfig()
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.source is not None and self.ros is not None:
+            raise ConfigError("[source] and [ros]: one robot has one SLAM; remove one of the two")
         rate = self.network.receive_bytes_per_second_per_robot
         least = self.sync.chunk_bytes + (1 << 16)
         if rate < least:  # no question would ever come through
@@ -194,7 +209,13 @@ def load_settings(path: Path) -> Settings:
 
     Raises ConfigError that names the file, the key and what is wanted.
     """
-    config = load_config(path, AgentConfig)
+    try:
+        config = load_config(path, AgentConfig)
+    except ConfigError as error:
+        if "required field `store`" in str(error):
+            remedy = 'add one with path = "data/ledger.db"'
+            raise ConfigError(f"{path}: there is no table [store]; {remedy}") from None
+        raise
     if not config.name and not config.closed:
         try:
             config = msgspec.structs.replace(config, name=path.stem)

@@ -5,8 +5,8 @@ The columns of `nodes` are described in `lattice`.
 
 from __future__ import annotations
 
-from ..model import Int32s, Int64s
-from .jit import inner, kernel
+from ..model import Int32s, Int64s, Uint8s
+from .jit import inner, kernel, leaf
 from .lattice import CHILD, FLAGS, ISSUED, MARKED, PARENTS, WITHDRAWN, wide
 
 SATURATED = (1 << 63) - 1
@@ -124,3 +124,27 @@ def gather(
             return i, count
         count = end
     return cores.shape[0], count
+
+
+@leaf
+def count_children(children: Uint8s, parents: Int64s, most: int) -> bool:
+    """Count new children of features, unless one of these would have more than `most` then.
+
+    children: (F,) of each feature. parents: (n, P) features below F, -1 none.
+    """
+    slots, left = parents.shape[1], parents.size
+    done, room = 0, True
+    while done < left and room:
+        parent = int(parents[done // slots, done % slots])
+        room = parent < 0 or children[parent] < most
+        if room:
+            if parent >= 0:
+                children[parent] += 1
+            done += 1
+    if not room:
+        while done > 0:
+            done -= 1
+            parent = int(parents[done // slots, done % slots])
+            if parent >= 0:
+                children[parent] -= 1
+    return room

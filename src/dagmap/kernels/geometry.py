@@ -55,6 +55,28 @@ def apply_pose(pose: Int32s, points: Int32s, out: Int32s, inside: Bools) -> None
             inside[i] = False
 
 
+@kernel
+def carry_segments(
+    poses: Int32s, starts: Int64s, points: Int32s, out: Int32s, origins: Int32s, inside: Bools
+) -> None:
+    """Carry segments of points through two poses each: out = poses[k, 1] * (poses[k, 0] * points).
+
+    poses: (k, 2, 7); zeros where a segment is left out: its rows of `inside` are cleared. starts:
+    (k + 1,) of the segments. origins: (k, 3) is set to where (0, 0, 0) comes to.
+    """
+    at = np.ones(1, np.bool_)
+    for k in range(starts.shape[0] - 1):
+        begin, end = int(starts[k]), int(starts[k + 1])
+        if not poses[k].any():
+            inside[begin:end] = False
+            continue
+        origins[k] = 0
+        apply_pose(poses[k, 0], points[begin:end], out[begin:end], inside[begin:end])
+        apply_pose(poses[k, 1], out[begin:end], out[begin:end], inside[begin:end])
+        apply_pose(poses[k, 0], origins[k : k + 1], origins[k : k + 1], at)
+        apply_pose(poses[k, 1], origins[k : k + 1], origins[k : k + 1], at)
+
+
 def carry(pose: Int32s, points: Int32s) -> tuple[Int32s, Bools]:
     """Points (N, 3) mm through a pose, and which of them stay within range."""
     out, inside = np.empty_like(points), np.ones(len(points), np.bool_)

@@ -46,6 +46,7 @@ class Seen(NamedTuple):
 
     xyz: Int32s
     alive: Bools
+    starts: Int64s
     cycle: Int32s
     color: Uint8s
     colored: Bools
@@ -172,11 +173,11 @@ def _note(nodes: Nodes, node: int, author: int, sign: int) -> None:
 
 
 @inner
-def _accumulate(nodes: Nodes, node: int, seen: Seen, i: int, sign: int) -> None:
+def _accumulate(nodes: Nodes, node: int, seen: Seen, i: int, segment: int, sign: int) -> None:
     nodes.observed[node] += sign
     for axis in range(3):
         nodes.offset[node, axis] += sign * (int(seen.xyz[i, axis]) - int(nodes.seed[node, axis]))
-    if seen.colored[i]:
+    if seen.colored[segment]:
         nodes.color_count[node] += sign
         for channel in range(3):
             nodes.color[node, channel] += sign * int(seen.color[i, channel])
@@ -199,21 +200,23 @@ def apply(
     undo: (n + s,) is written: the last counted cycle before, FIRST_SEEN or NOT_COUNTED.
     """
     count = seen.xyz.shape[0]
-    for i in range(count):
-        if not seen.alive[i]:
-            features[base + i] = -1
-            undo[i] = NOT_COUNTED
-            continue
-        x, y, z = int(seen.xyz[i, 0]), int(seen.xyz[i, 1]), int(seen.xyz[i, 2])
-        node = find_twin(nodes, shift, reach, x, y, z)
-        if node < 0:
-            node = _create(nodes, shift, x, y, z)
-            for axis in range(3):
-                nodes.origin[node, axis] = seen.origin[i, axis]
-        _accumulate(nodes, node, seen, i, 1)
-        features[base + i] = node
-        undo[i] = _hit(nodes, node, author, int(seen.cycle[i]))
-        _note(nodes, node, author, 1)
+    for k in range(seen.starts.shape[0] - 1):
+        cycle = int(seen.cycle[k])
+        for i in range(int(seen.starts[k]), int(seen.starts[k + 1])):
+            if not seen.alive[i]:
+                features[base + i] = -1
+                undo[i] = NOT_COUNTED
+                continue
+            x, y, z = int(seen.xyz[i, 0]), int(seen.xyz[i, 1]), int(seen.xyz[i, 2])
+            node = find_twin(nodes, shift, reach, x, y, z)
+            if node < 0:
+                node = _create(nodes, shift, x, y, z)
+                for axis in range(3):
+                    nodes.origin[node, axis] = seen.origin[k, axis]
+            _accumulate(nodes, node, seen, i, k, 1)
+            features[base + i] = node
+            undo[i] = _hit(nodes, node, author, cycle)
+            _note(nodes, node, author, 1)
     for j in range(seen.sightings.shape[0]):
         number = int(seen.sightings[j])
         undo[count + j] = NOT_COUNTED
@@ -238,15 +241,16 @@ def revert(
         number = int(seen.sightings[j])
         if 0 <= number < features.shape[0] and features[number] >= 0:
             _take_back(nodes, int(features[number]), author, int(undo[count + j]))
-    for i in range(count - 1, -1, -1):
-        node = int(features[base + i])
-        if node < 0:
-            continue
-        _note(nodes, node, author, -1)
-        _take_back(nodes, node, author, int(undo[i]))
-        _accumulate(nodes, node, seen, i, -1)
-        if nodes.observed[node] == 0:
-            _discard_newest(nodes, shift)
+    for k in range(seen.starts.shape[0] - 2, -1, -1):
+        for i in range(int(seen.starts[k + 1]) - 1, int(seen.starts[k]) - 1, -1):
+            node = int(features[base + i])
+            if node < 0:
+                continue
+            _note(nodes, node, author, -1)
+            _take_back(nodes, node, author, int(undo[i]))
+            _accumulate(nodes, node, seen, i, k, -1)
+            if nodes.observed[node] == 0:
+                _discard_newest(nodes, shift)
 
 
 @inner

@@ -204,9 +204,9 @@ class Mission:
         """The largest share of all honest transactions that one honest robot lacks."""
         honest = self.honest
         total = sum(len(robot.own) for robot in honest)
-        authors = [robot.author for robot in honest]
+        authors = {robot.author for robot in honest}
         held = [
-            sum(robot.agent.ledger.chain(author).end for author in authors)
+            sum(c.end for author, c in robot.agent.ledger.chains.items() if author in authors)
             for robot in honest
             if robot.up
         ]

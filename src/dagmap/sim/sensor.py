@@ -19,15 +19,16 @@ MIN_BASELINE = 0.01  # m: what a camera that turns on the spot is moved by all t
 class SensorConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The table [sensor]."""
 
-    kind: Literal["depth", "lidar", "mono"] = "depth"
+    kind: Literal["depth", "lidar", "mono", "stereo"] = "depth"
     points: int = 60  # per cycle, at most
     period: float = 1.0  # s between cycles
     range: float = 6.0  # m
     field: tuple[float, float] = (75.0, 55.0)  # degrees, across (a lidar: always 360) and up
     height: float = 1.0  # m above the floor
-    noise: float = 0.01  # m along the ray, standard deviation; mono: see `pixel`
-    pixel: float = 0.5  # mono: px of noise in the image, standard deviation
-    focal: float = 500.0  # mono: px, the focal length
+    noise: float = 0.01  # m along the ray, standard deviation; mono, stereo: see `pixel`
+    pixel: float = 0.5  # mono, stereo: px of noise in the image, standard deviation
+    focal: float = 500.0  # mono, stereo: px, the focal length
+    baseline: float = 0.06  # stereo: m between the cameras
     outliers: float = 0.02  # share of new points that lie at 0.3 to 1.6 times their distance
     tracked: float = 0.2  # share of points, at most, that were seen in the cycle before
     colors: bool = False  # whether points have the colour of their surface
@@ -42,6 +43,7 @@ class SensorConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         self._require_range("noise", 0.0, 10.0)
         self._require_range("pixel", 0.0, 100.0)
         self._require_range("focal", 1.0, 1e5)
+        self._require_range("baseline", MIN_BASELINE, 10.0)
         self._require_range("outliers", 0.0, 1.0)
         self._require_range("tracked", 0.0, 0.75)
 
@@ -83,11 +85,13 @@ class Sensor:
         """Distances (N, R) with noise, and which of them a SLAM keeps.
 
         rays: (N, R, 3). depth: (N, R) m along them. noise: (N, R) normal. baseline: (N,) m by
-        which a single camera has moved to triangulate: its disparities have the noise, so depths
-        have one that grows with depth^2 / baseline, and what comes out behind the camera or
-        beyond twice the range is dropped.
+        which a single camera has moved to triangulate; two have theirs. Disparities have the noise,
+        so depths have one that grows with depth^2 / baseline, and what comes out behind the camera
+        or beyond twice the range is dropped.
         """
-        if self.config.kind != "mono":
+        if self.config.kind == "stereo":
+            baseline = np.full_like(baseline, self.config.baseline)
+        elif self.config.kind != "mono":
             measured = depth + self.config.noise * noise
             return measured, measured > 0
         ahead = depth * rays[..., 0]

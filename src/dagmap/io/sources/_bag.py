@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from ...model import RecordingError
 from ._ros import Unusable
+from ._rtabmap_msgs import register
 from ._salvage import Cut, Record, mcap_records, ros1_records
 from ._source import Skips
 
@@ -81,6 +82,8 @@ class Bag:
         decode = types.deserialize_cdr if self.ros2 else types.deserialize_ros1
         try:
             return convert(decode(message.raw, message.kind))
+        except RecordingError:
+            raise
         except Unusable as fault:
             raise self.wrong(message, fault) from None
         except Exception as error:  # noqa: BLE001  see above
@@ -98,6 +101,7 @@ class Bag:
     def _open(self) -> Any:
         stores = self._typesys
         default = stores.get_typestore(stores.Stores.ROS2_HUMBLE)
+        register(default, stores)
         return self._rosbags.AnyReader([self.path], default_typestore=default)
 
     def _look(self) -> tuple[dict[str, Topic], Any]:

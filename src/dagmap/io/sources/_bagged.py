@@ -15,87 +15,27 @@ from ._bag import Bag, Message
 from ._cloud import thinned
 from ._kiss import KissIcp
 from ._odometry import PictureOdometry
-from ._poses import SLACK, FrameTree, Trajectory, nearest
+from ._poses import SLACK, SensorPoses, nearest
 from ._rgbd import Camera, FrontEnd, import_cv2, load_camera
 from ._source import Options, Skips, checked
 
-_FIXED = ("map", "odom", "world", "earth")  # what stands still is called so, by REP 105
 _STORED = 200  # pictures that wait for their partner at most
 
 
-class BagPoses:
-    """Where a sensor was: odometry (or another pose), with tf between its frame and the sensor's;
-    or tf alone.
-    """
+class BagPoses(SensorPoses):
+    """Where a sensor was, by the odometry (or another pose) and the tf of a bag."""
 
     def __init__(self, bag: Bag, topic: str, tf: tuple[str, ...], options: Options) -> None:
-        self._bag, self._options, self.topic = bag, options, topic
-        self._trajectory, self._tree, self._child = Trajectory(), FrameTree(), ""
+        super().__init__(str(bag.path), topic, options.frame, options.same_frame)
         for message in bag.messages({topic, *tf} - {""}):
             try:
                 if message.topic == topic:
-                    self._take_pose(message)
+                    self.add_pose(*bag.read(message, ros.pose_of))
                 else:
-                    self._take_frames(message)
+                    found = bag.read(message, ros.transforms)
+                    self.add_frames(found, still="static" in message.topic)
             except RecordingError as error:
                 bag.skips.note(error)
-
-    @property
-    def known(self) -> bool:
-        return bool(len(self._trajectory)) or bool(len(self._tree) and not self.topic)
-
-    def check(self, frame: str) -> str:
-        """What the poses are, in words. Raises RecordingError where they do not fit a frame."""
-        if self.topic:
-            if self._same(frame):
-                return f"poses of {self.topic}"
-            if self._tree.connects(self._child, frame):
-                return f"poses of {self.topic}, tf from {self._child} to {frame}"
-            raise RecordingError(
-                f"{self._bag.path}: {self.topic} tells where {self._child!r} is, and no tf leads "
-                f"from there to {frame!r}, the sensor's frame; record /tf_static too, or say "
-                "--same-frame if the poses are the sensor's"
-            )
-        return f"poses by tf: {frame} in {self._fixed(frame)}"
-
-    def at(self, stamp: float, frame: str) -> Floats | None:
-        """(4, 4) of the sensor at a moment; None where it is not known."""
-        if not self.topic:
-            return self._tree.pose(self._fixed(frame), frame, stamp)
-        pose = self._trajectory.at(stamp)
-        if pose is None or self._same(frame):
-            return pose
-        mounted = self._tree.pose(self._child, frame, stamp)
-        return None if mounted is None else pose @ mounted
-
-    def _same(self, frame: str) -> bool:
-        return self._options.same_frame or self._child in ("", frame)
-
-    def _fixed(self, frame: str) -> str:
-        above = self._tree.above(frame)
-        named = self._options.frame
-        if named is not None:
-            if named.lstrip("/") not in above:
-                raise RecordingError(
-                    f"{self._bag.path}: no tf leads from {named!r} to {frame!r}; above it are "
-                    f"{', '.join(above)}"
-                )
-            return named.lstrip("/")
-        if len(above) == 1:
-            raise RecordingError(
-                f"{self._bag.path}: no tf leads to {frame!r}, the sensor's frame; record /tf and "
-                "/tf_static too, or name a topic with poses by --topic"
-            )
-        return next((name for name in _FIXED if name in above), above[-1])
-
-    def _take_pose(self, message: Message) -> None:
-        self._child, stamp, pose = self._bag.read(message, ros.pose_of)
-        self._trajectory.add(stamp, pose)
-
-    def _take_frames(self, message: Message) -> None:
-        still = "static" in message.topic
-        for parent, child, stamp, pose in self._bag.read(message, ros.transforms):
-            self._tree.add(parent, child, None if still else stamp, pose)
 
 
 class _Stamps:
@@ -153,7 +93,10 @@ class CloudBag:
                 continue
             try:
                 points, colors = self._bag.read(message, ros.cloud_arrays)
-                pose = odometry.register(points) if odometry else (self._poses or {})[number]
+                if odometry is None:
+                    pose = (self._poses or {})[number]
+                else:
+                    pose = odometry.register(points, self._bag.path)
                 points, colors = thinned(points, colors, self._options)
                 cycle = Cycle(self._stamps[number], pose, points, colors=colors)
                 yield checked(cycle, self._bag.path)

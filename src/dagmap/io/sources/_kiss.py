@@ -36,10 +36,15 @@ class KissIcp:
                 "odometry by KISS-ICP"
             ) from None
 
-    def register(self, points: Floats) -> Floats:
-        """(4, 4) pose of a cloud (N, 3) m in the frame of the first one. Raises RecordingError."""
+    def register(self, points: Floats, cloud: Path) -> Floats:
+        """(4, 4) pose of a cloud (N, 3) m in the frame of the first one.
+
+        cloud: its file, for errors. Raises RecordingError.
+        """
         good = points[np.isfinite(points).all(axis=1)]
         if len(good) < _LEAST:
-            raise RecordingError(f"a cloud of {len(good)} points is too sparse for odometry")
+            raise RecordingError(
+                f"{cloud}: a cloud of {len(good)} points is too sparse for odometry; give poses"
+            )
         self._odometry.register_frame(good, np.zeros(len(good)))
         return np.array(self._odometry.last_pose, np.float64)

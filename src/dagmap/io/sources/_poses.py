@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 
-from ...model import Floats
+from ...model import Floats, RecordingError
 
 SLACK = 0.020 + 1e-9  # s: stamps no further apart are of one moment
 _GAP = 1.0  # s: over longer ones nothing is interpolated
 _MOST_FRAMES = 100  # between a sensor and the fixed frame
+_FIXED = ("map", "odom", "world", "earth")  # what stands still is called so, by REP 105
 
 
 def matrix(translation: Floats, quaternion: Floats) -> Floats | None:
@@ -70,6 +72,21 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self._rows)
 
+    @property
+    def newest(self) -> float:
+        """The last stamp; -inf where there is none."""
+        return max(self._rows, default=-np.inf)
+
+    def forget(self, before: float) -> None:
+        """Let go of what is older."""
+        self._rows = {stamp: pose for stamp, pose in self._rows.items() if stamp >= before}
+        self._stamps = None
+
+    def all(self) -> tuple[Floats, Floats]:
+        """Rising stamps (M,) and poses (M, 4, 4)."""
+        stamps = sorted(self._rows)
+        return np.array(stamps), np.array([self._rows[stamp] for stamp in stamps])
+
     def at(self, stamp: float) -> Floats | None:
         """(4, 4) interpolated; the nearest one within 20 ms where there is no pair; else None."""
         if not self._rows:
@@ -104,12 +121,33 @@ class FrameTree:
     def __len__(self) -> int:
         return len(self._parents)
 
+    def knows(self, frame: str) -> bool:
+        """Whether a frame has a parent."""
+        return frame in self._parents
+
+    @property
+    def still(self) -> list[tuple[str, str, float, Floats]]:
+        """What never moves, as (parent, child, 0, pose)."""
+        return [(self._parents[child], child, 0.0, pose) for child, pose in self._still.items()]
+
     def above(self, frame: str) -> list[str]:
         """The frame, its parent, and so on up to the root."""
         chain = [frame]
         while chain[-1] in self._parents and len(chain) < _MOST_FRAMES:
             chain.append(self._parents[chain[-1]])
         return chain
+
+    def reached(self, target: str, frame: str) -> float:
+        """Up to when the tree tells where `frame` is in `target`; inf where it never moves."""
+        chains = self.above(target), self.above(frame)
+        apart = set(chains[0]) ^ set(chains[1])  # what both have above them does not count
+        moving = (self._moving[child] for child in apart if child in self._moving)
+        return min((each.newest for each in moving), default=np.inf)
+
+    def forget(self, before: float) -> None:
+        """Let go of poses that are older."""
+        for trajectory in self._moving.values():
+            trajectory.forget(before)
 
     def connects(self, target: str, frame: str) -> bool:
         return bool(set(self.above(target)) & set(self.above(frame)))
@@ -133,6 +171,87 @@ class FrameTree:
                 return None
             pose = step @ pose
         return pose
+
+
+class SensorPoses:
+    """Where a sensor was: odometry (or another pose), with tf between its frame and the sensor's;
+    or tf alone.
+
+    where: what errors name. topic: of the poses; empty: tf alone. fixed: the frame that stands
+    still, where tf has several. same_frame: poses are the sensor's, whatever frames are called.
+    """
+
+    def __init__(self, where: str, topic: str, fixed: str | None, same_frame: bool) -> None:
+        self._where, self.topic = where, topic
+        self._named, self._same_frame = fixed, same_frame
+        self.trajectory, self.tree, self._child = Trajectory(), FrameTree(), ""
+
+    def add_pose(self, child: str, stamp: float, pose: Floats) -> None:
+        """A pose of the topic. child: what it is the pose of, "" where it does not say."""
+        self._child = child
+        self.trajectory.add(stamp, pose)
+
+    def add_frames(self, found: Iterable[tuple[str, str, float, Floats]], still: bool) -> None:
+        """(parent, child, stamp, pose) of tf. still: they never move."""
+        for parent, child, stamp, pose in found:
+            self.tree.add(parent, child, None if still else stamp, pose)
+
+    @property
+    def known(self) -> bool:
+        return bool(len(self.trajectory)) or bool(len(self.tree) and not self.topic)
+
+    def check(self, frame: str) -> str:
+        """What the poses are, in words. Raises RecordingError where they do not fit a frame."""
+        if self.topic:
+            if self._same(frame):
+                return f"poses of {self.topic}"
+            if self.tree.connects(self._child, frame):
+                return f"poses of {self.topic}, tf from {self._child} to {frame}"
+            raise RecordingError(
+                f"{self._where}: {self.topic} tells where {self._child!r} is, and no tf leads "
+                f"from there to {frame!r}, the sensor's frame; record /tf_static too, or say "
+                "--same-frame if the poses are the sensor's"
+            )
+        return f"poses by tf: {frame} in {self.fixed(frame)}"
+
+    def at(self, stamp: float, frame: str) -> Floats | None:
+        """(4, 4) of the sensor at a moment; None where it is not known."""
+        if not self.topic:
+            return self.tree.pose(self.fixed(frame), frame, stamp)
+        pose = self.trajectory.at(stamp)
+        if pose is None or self._same(frame):
+            return pose
+        mounted = self.tree.pose(self._child, frame, stamp)
+        return None if mounted is None else pose @ mounted
+
+    def reached(self, frame: str) -> float:
+        """Up to which stamp it is known where the sensor was."""
+        if not self.topic:
+            return self.tree.reached(self.fixed(frame), frame)
+        if self._same(frame):
+            return self.trajectory.newest
+        return min(self.trajectory.newest, self.tree.reached(self._child, frame))
+
+    def _same(self, frame: str) -> bool:
+        return self._same_frame or self._child in ("", frame)
+
+    def fixed(self, frame: str) -> str:
+        """The frame that stands still. Raises RecordingError where none leads to the sensor's."""
+        above = self.tree.above(frame)
+        if self._named is not None:
+            named = self._named.lstrip("/")
+            if named not in above:
+                raise RecordingError(
+                    f"{self._where}: no tf leads from {self._named!r} to {frame!r}; above it are "
+                    f"{', '.join(above)}"
+                )
+            return named
+        if len(above) == 1:
+            raise RecordingError(
+                f"{self._where}: no tf leads to {frame!r}, the sensor's frame; record /tf and "
+                "/tf_static too, or name a topic with poses by --topic"
+            )
+        return next((name for name in _FIXED if name in above), above[-1])
 
 
 def nearest(rising: Floats, stamps: Floats) -> list[int]:

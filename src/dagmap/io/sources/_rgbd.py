@@ -103,12 +103,12 @@ class FrontEnd:
         return place, none if described is None else described[rows]
 
     def _color(self, path: Path) -> Uint8s:
-        picture = self._decode(path, self._cv2.IMREAD_COLOR)
+        picture = decode(self._cv2, path, self._cv2.IMREAD_COLOR)
         self._check_size(path, picture)
         return picture.astype(np.uint8, copy=False)
 
     def _depth(self, path: Path) -> Floats:
-        picture = self._decode(path, self._cv2.IMREAD_UNCHANGED)
+        picture = decode(self._cv2, path, self._cv2.IMREAD_UNCHANGED)
         if picture.ndim != 2 or picture.dtype != np.uint16:
             raise RecordingError(
                 f"{path}: {picture.dtype} {picture.shape} is no depth picture; one channel of 16 "
@@ -117,22 +117,6 @@ class FrontEnd:
         self._check_size(path, picture)
         return picture / self._camera.depth_scale
 
-    def _decode(self, path: Path, flags: int) -> npt.NDArray[Any]:
-        data = read_bytes(path)
-        if not complete(data):
-            raise RecordingError(
-                f"{path}: the picture is truncated or damaged; copy it anew, or drop its frame"
-            )
-        try:
-            picture = self._cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-        except self._cv2.error:
-            picture = None
-        if picture is None:
-            raise RecordingError(
-                f"{path}: OpenCV cannot read this as a picture; copy it anew, or drop its frame"
-            )
-        return np.asarray(picture)
-
     def _check_size(self, path: Path, picture: npt.NDArray[Any]) -> None:
         wanted = (self._camera.height, self._camera.width)
         if picture.shape[:2] != wanted:
@@ -140,6 +124,24 @@ class FrontEnd:
                 f"{path}: {picture.shape[1]} x {picture.shape[0]} pixels, but the camera has "
                 f"{wanted[1]} x {wanted[0]}; name the right one with --camera FILE"
             )
+
+
+def decode(cv2: Any, path: Path, flags: int) -> npt.NDArray[Any]:
+    """The picture in a file, as OpenCV reads it with these flags. Raises RecordingError."""
+    data = read_bytes(path)
+    if not complete(data):
+        raise RecordingError(
+            f"{path}: the picture is truncated or damaged; copy it anew, or drop its frame"
+        )
+    try:
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        picture = None
+    if picture is None:
+        raise RecordingError(
+            f"{path}: OpenCV cannot read this as a picture; copy it anew, or drop its frame"
+        )
+    return np.asarray(picture)
 
 
 def complete(data: bytes) -> bool:

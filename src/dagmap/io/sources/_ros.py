@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...model import Floats, Uint8s
+from ._cloud import doubles
 from ._poses import matrix
 from ._rgbd import complete
 
@@ -54,6 +55,15 @@ def frame_name(name: str) -> str:
     return name.rstrip("\0").lstrip("/")
 
 
+def stamp_of(message: Any) -> float:
+    """s, of the header. Raises Unusable where it is empty."""
+    stamp = message.header.stamp
+    seconds = stamp.sec + stamp.nanosec / 1e9
+    if not seconds:
+        raise Unusable("its header has no stamp; the driver must give it one")
+    return float(seconds)
+
+
 def cloud_arrays(message: Any) -> tuple[Floats, Uint8s | None]:
     """(N, 3) m and (N, 3) RGB or None of a PointCloud2. Raises Unusable."""
     fields = {f.name: f for f in message.fields}
@@ -81,7 +91,8 @@ def cloud_arrays(message: Any) -> tuple[Floats, Uint8s | None]:
     kind = np.dtype({"names": wanted, "formats": kinds, "offsets": places, "itemsize": step})
     data = data[: row * height].reshape(height, row)[:, : step * width]
     rows = np.frombuffer(data.tobytes(), kind)
-    points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    with np.errstate(invalid="ignore"):  # signalling NaNs stay what they are
+        points = np.stack([doubles(rows[axis]) for axis in "xyz"], axis=1)
     color = next((name for name in ("rgb", "rgba") if name in wanted), None)
     if color is None or rows.dtype[color].itemsize != 4:
         return points, None

@@ -92,7 +92,7 @@ def folder_name(path: Path) -> str:
     return Path(os.path.abspath(path)).name
 
 
-def checked(cycle: Cycle, path: Path) -> Cycle:
+def checked(cycle: Cycle, path: Path | str) -> Cycle:
     """The same cycle. Raises RecordingError naming the file where an agent would refuse it."""
     try:
         quantise_cycle(cycle)
@@ -107,6 +107,8 @@ def read_bytes(path: Path) -> bytes:
         return path.read_bytes()
     except FileNotFoundError:
         raise RecordingError(f"{path}: missing; the recording needs it") from None
+    except ValueError:  # a zero byte
+        raise RecordingError(f"{path}: no file can have this name; correct the list") from None
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror})") from None
 
@@ -117,9 +119,6 @@ def read_rows(path: Path) -> list[tuple[int, list[str]]]:
         text = read_bytes(path).decode()
     except UnicodeDecodeError:
         raise RecordingError(f"{path}: not a text file in UTF-8; write it anew") from None
-    rows = ((number, line.strip()) for number, line in enumerate(text.splitlines(), 1))
-    return [
-        (number, line.replace(",", " ").split())
-        for number, line in rows
-        if line and not line.startswith("#")
-    ]
+    lines = ((number, line.strip()) for number, line in enumerate(text.splitlines(), 1))
+    rows = [(number, line.replace(",", " ").split()) for number, line in lines if line[:1] != "#"]
+    return [(number, words) for number, words in rows if words]

@@ -98,7 +98,8 @@ class ColmapModel:
         for i, picture in enumerate(self._pictures):
             rows = self._rows(picture)
             back = inverse(picture.pose)
-            places = self._points.places[rows] @ back[:3, :3].T + back[:3, 3]
+            with np.errstate(over="ignore", invalid="ignore"):  # what is too far is refused below
+                places = self._points.places[rows] @ back[:3, :3].T + back[:3, 3]
             try:
                 cycle = checked(
                     Cycle(
@@ -119,7 +120,8 @@ class ColmapModel:
         at = np.minimum(np.searchsorted(points.ids, ids), len(points.ids) - 1)
         rows = at[points.ids[at] == ids]
         if self._options.max_depth is not None:
-            distance = np.linalg.norm(points.places[rows] - picture.pose[:3, 3], axis=1)
+            with np.errstate(over="ignore", invalid="ignore"):
+                distance = np.linalg.norm(points.places[rows] - picture.pose[:3, 3], axis=1)
             rows = rows[distance <= self._options.max_depth]
         if len(rows) > self._options.max_features:
             best = np.argsort(points.errors[rows], kind="stable")[: self._options.max_features]
@@ -240,4 +242,5 @@ def _picture(where: str, name: str, numbers: list[float], seen: npt.NDArray[np.u
     pose = matrix(np.array(place), np.array([x, y, z, w]))
     if pose is None:
         raise RecordingError(f"{where}: the rotation is no unit quaternion; export the model anew")
-    return _Picture(name, inverse(pose), seen[seen != _NO_POINT])
+    shown = "".join(c if c.isprintable() else "?" for c in name)  # it stands in errors
+    return _Picture(shown, inverse(pose), seen[seen != _NO_POINT])

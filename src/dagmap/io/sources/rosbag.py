@@ -1,6 +1,7 @@
 """ROS bags, of ROS 1 (.bag) and ROS 2 (.mcap, .db3, a folder), read without ROS.
 
-Clouds with poses (odometry or tf; else by KISS-ICP), or pictures with depth and camera info.
+Clouds with poses (odometry or tf; else by KISS-ICP), RTAB-Map's MapData, or pictures with depth and
+camera info.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from ...model import RecordingError
 from . import _ros as ros
 from ._bag import Bag
 from ._bagged import BagPoses, CloudBag, RgbdBag
+from ._mapped import MapDataBag
+from ._rtabmap_msgs import MAP_DATA, MAP_GRAPH
 from ._source import Description, Item, Options, Skips, Source
 
 UNDERSTANDS = "a ROS bag (.bag, .mcap, .db3, or the folder of one)"
@@ -36,10 +39,13 @@ class _Plan:
     camera: str = ""
     pose: str = ""
     tf: tuple[str, ...] = ()
+    mapped: str = ""
+    graph: str = ""
 
     def use(self, topic: str) -> str:
         named = {self.cloud: "clouds", self.depth: "depth", self.color: "colour"}
         named |= {self.camera: "camera", self.pose: "poses"}
+        named |= {self.mapped: "nodes", self.graph: "moved"}
         return named.get(topic, "frames" if topic in self.tf else "")
 
 
@@ -48,6 +54,8 @@ def open(path: Path, options: Options) -> Source:  # noqa: A001
     skips = Skips(options.keep_going)
     bag = Bag(path, skips)
     plan = _plan(bag, options)
+    if plan.mapped:
+        return MapDataBag(bag, plan.mapped, plan.graph, options, skips)
     poses = BagPoses(bag, plan.pose, plan.tf, options)
     if plan.cloud:
         return CloudBag(bag, plan.cloud, poses, options, skips)
@@ -85,14 +93,18 @@ def _plan(bag: Bag, options: Options) -> _Plan:
     if asked or _asked(bag, options, ros.TF):
         pose = asked
     cloud = _first(bag, options, (ros.CLOUD,))
+    mapped, asked_cloud = _first(bag, options, MAP_DATA), _asked(bag, options, (ros.CLOUD,))
     depth = _picture(bag, options, depth=True)
     by_pictures = _asked(bag, options, (ros.IMAGE, ros.COMPRESSED))
-    if cloud and not (by_pictures and not _asked(bag, options, (ros.CLOUD,))):
+    if _asked(bag, options, MAP_DATA) or (mapped and not (cloud or by_pictures)):
+        return _Plan(mapped=mapped, graph=_first(bag, options, MAP_GRAPH))
+    if cloud and not (by_pictures and not asked_cloud):
         return _Plan(cloud=cloud, pose=pose, tf=tf)
     if not depth:
         raise RecordingError(
-            f"{bag.path}: neither clouds ({ros.CLOUD}) nor pictures with depth ({ros.IMAGE} or "
-            f"{ros.COMPRESSED} with `depth` in the topic's name); `dagmap inspect` lists what "
+            f"{bag.path}: neither clouds ({ros.CLOUD}), nor {MAP_DATA[0]}, nor pictures with depth "
+            f"({ros.IMAGE} or {ros.COMPRESSED} with `depth` in the topic's name); `dagmap inspect` "
+            "lists what "
             "there is, --topic names what to use"
         )
     color = _picture(bag, options, depth=False)

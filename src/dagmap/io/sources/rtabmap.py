@@ -91,20 +91,28 @@ class RtabmapDatabase:
             for i, node in enumerate(self._nodes):
                 last = i == len(self._nodes) - 1
                 rows = database.execute(_FEATURES, (node.id, 4 * self._options.max_features))
-                points = np.array(rows.fetchall(), np.float64).reshape(-1, 3)
-                cycle = Cycle(
-                    node.stamp,
-                    node.moved if last and node.moved is not None else node.pose,
-                    self._chosen(points),
-                    moved=self._moves() if last else None,
-                    session=node.session,
-                )
                 try:
+                    cycle = Cycle(
+                        node.stamp,
+                        node.moved if last and node.moved is not None else node.pose,
+                        self._chosen(self._positions(node, rows.fetchall())),
+                        moved=self._moves() if last else None,
+                        session=node.session,
+                    )
                     cycle = checked(cycle, self._path)
                 except RecordingError as error:
                     self.skips.note(error)
                     continue
                 yield cycle
+
+    def _positions(self, node: _Node, rows: list[tuple[Any, ...]]) -> Floats:
+        """(N, 3) m; SQLite keeps anything in any column."""
+        try:
+            return np.array(rows, np.float64).reshape(-1, 3)
+        except (TypeError, ValueError) as error:
+            raise RecordingError(
+                f"{self._path}: node {node.id}: a position is no number ({error}); copy it anew"
+            ) from None
 
     def _chosen(self, points: Floats) -> Floats:
         """With a position, near enough, the strongest ones. In the robot's frame."""
@@ -133,7 +141,7 @@ class RtabmapDatabase:
             pose = optimised.get(id_) if together else _pose(blob)
             if pose is None:
                 continue  # it was not localised
-            session = 0 if together else max(int(map_id), 0)
+            session = map_id if isinstance(map_id, int) and map_id > 0 and not together else 0
             try:
                 rising = float(stamp) > last.get(session, -np.inf)
             except (TypeError, ValueError):

@@ -17,10 +17,10 @@ import numpy as np
 
 from ...model import Cycle, Floats, RecordingError, Uint8s
 from ..ply import read_vertices
-from ._cloud import thinned
+from ._cloud import doubles, thinned
 from ._kiss import KissIcp
 from ._pcd import read_pcd
-from ._poses import Trajectory, inverse, matrix
+from ._poses import inverse
 from ._source import (
     Description,
     Item,
@@ -31,6 +31,7 @@ from ._source import (
     read_bytes,
     read_rows,
 )
+from ._trajectory import numbers, read_tum
 
 UNDERSTANDS = "a folder of clouds (KITTI's .bin, .pcd or .ply; poses.txt)"
 _FOLDERS = ("velodyne", "velodyne_points/data", "clouds", "scans", "pcd", "ply", ".")
@@ -90,10 +91,10 @@ class ScanFolder:
         odometry = KissIcp(self._options) if self._poses is None else None
         for i, (stamp, cloud) in enumerate(zip(self._stamps, self._clouds, strict=True)):
             try:
-                points, colors = _READERS[cloud.suffix.lower()](cloud)
+                points, colors = READERS[cloud.suffix.lower()](cloud)
                 pose = self._poses[i] if self._poses is not None else np.eye(4)
                 if odometry is not None:
-                    pose = odometry.register(points)
+                    pose = odometry.register(points, cloud)
                 points, colors = thinned(points, colors, self._options)
                 cycle = checked(Cycle(stamp, pose, points, colors=colors), cloud)
             except RecordingError as error:
@@ -123,7 +124,7 @@ class ScanFolder:
     def _by_stamp(
         self, file: Path, stamps: list[float] | None, clouds: list[Path]
     ) -> tuple[list[float], list[Path], list[Floats]]:
-        trajectory = _tum_poses(file)
+        trajectory = read_tum(file)
         if stamps is None:
             raise RecordingError(
                 f"{self._path}: {file.name} goes by stamps, but the clouds have none; name them by "
@@ -146,7 +147,7 @@ def _clouds(path: Path) -> list[Path]:
         place = path / folder
         if place.is_dir() and not (folder == "." and (path / "rgb").is_dir()):  # a TUM folder
             for suffix in _SUFFIXES:
-                found = [file for file in place.glob(f"*{suffix}") if file.is_file()]
+                found = [file for file in place.glob(f"[!.]*{suffix}") if file.is_file()]
                 if found:
                     return sorted(found, key=_by_number)
     return []
@@ -166,7 +167,7 @@ def _stamps(path: Path, clouds: list[Path]) -> list[float] | None:
     file = path / "times.txt"
     if file.is_file():
         rows = read_rows(file)
-        stamps = [_numbers(file, number, words, 1)[0] for number, words in rows]
+        stamps = [numbers(file, number, words, 1)[0] for number, words in rows]
         if len(stamps) != len(clouds):
             raise RecordingError(
                 f"{file}: {len(stamps)} stamps for {len(clouds)} clouds; one a line is wanted"
@@ -186,24 +187,15 @@ def _require_rising(file: Path, stamps: list[float]) -> None:
             )
 
 
-def _numbers(file: Path, number: int, words: list[str], count: int) -> list[float]:
-    try:
-        values = [float(word) for word in words]
-    except ValueError:
-        values = []
-    if len(values) != count or not np.isfinite(values).all():
-        raise RecordingError(f"{file}, line {number}: {count} finite numbers are wanted")
-    return values
-
-
 def _kitti_poses(file: Path, rows: list[tuple[int, list[str]]], path: Path) -> list[Floats]:
     """(4, 4) each: of the LiDAR, where calib.txt says how it is mounted to KITTI's camera."""
     poses = []
     mounted = _calibration(path / "calib.txt")
     for number, words in rows:
         pose = np.eye(4)
-        pose[:3] = np.reshape(_numbers(file, number, words, 12), (3, 4))
-        poses.append(inverse(mounted) @ pose @ mounted)
+        pose[:3] = np.reshape(numbers(file, number, words, 12), (3, 4))
+        with np.errstate(over="ignore", invalid="ignore"):  # what is no pose is refused later
+            poses.append(inverse(mounted) @ pose @ mounted)
     if not poses:
         raise RecordingError(f"{file}: no poses; 12 numbers (KITTI) or 8 (TUM) a line are wanted")
     return poses
@@ -216,22 +208,11 @@ def _calibration(file: Path) -> Floats:
         return out
     for number, words in read_rows(file):
         if words[0] in ("Tr:", "Tr_velo_to_cam:"):
-            out[:3] = np.reshape(_numbers(file, number, words[1:], 12), (3, 4))
+            out[:3] = np.reshape(numbers(file, number, words[1:], 12), (3, 4))
             return out
     raise RecordingError(
         f"{file}: no line `Tr:`, from the LiDAR to the camera; add it, or remove it"
     )
-
-
-def _tum_poses(file: Path) -> Trajectory:
-    out = Trajectory()
-    for number, words in read_rows(file):
-        stamp, *values = _numbers(file, number, words, 8)
-        pose = matrix(np.array(values[:3]), np.array(values[3:]))
-        if pose is None:
-            raise RecordingError(f"{file}, line {number}: the quaternion is not of length 1")
-        out.add(stamp, pose)
-    return out
 
 
 def _read_bin(path: Path) -> tuple[Floats, Uint8s | None]:
@@ -242,15 +223,15 @@ def _read_bin(path: Path) -> tuple[Floats, Uint8s | None]:
             "reflectance, float32); it is cut short or of another format"
         )
     rows = np.frombuffer(data, "<f4").reshape(-1, _WHOLE_KITTI)
-    return rows[:, :3].astype(np.float64), None
+    return doubles(rows[:, :3]), None
 
 
 def _read_ply(path: Path) -> tuple[Floats, Uint8s | None]:
     rows = read_vertices(path, tuple("xyz"), "copy or write it anew", _FITS)
-    points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    points = np.stack([doubles(rows[axis]) for axis in "xyz"], axis=1)
     if not set(_COLORS) <= set(rows.dtype.names or ()):
         return points, None
     return points, np.stack([rows[name].astype(np.uint8) for name in _COLORS], axis=1)
 
 
-_READERS = {".bin": _read_bin, ".pcd": read_pcd, ".ply": _read_ply}
+READERS = {".bin": _read_bin, ".pcd": read_pcd, ".ply": _read_ply}

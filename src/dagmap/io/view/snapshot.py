@@ -137,7 +137,7 @@ def _edges_of(chain: list[Said], config: Config, centre: Floats, radius: float) 
     return np.concatenate(found)
 
 
-def _stamp(author: Author, cycles: Int64s) -> float:
+def _stamp(author: Author, cycles: Int32s) -> float:
     stamps = [anchor.stamp for c in cycles.tolist() if (anchor := author.anchors.get(c))]
     return max(stamps) / 1e6 if stamps else float("nan")
 

@@ -1,0 +1,62 @@
+"""All experiments, as many at a time as there are cores: `make figures`. `--out DIR`, `--jobs N`.
+
+Each is a process of its own, so that one that fails does not take the others with it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from rich.console import Console
+
+import common
+from dagmap.cli.kernels import warm_up
+
+# What takes longest first.
+ALL = (
+    "figure_11",
+    "section_5",
+    "completion",
+    "sensors",
+    "feature_poor",
+    "figure_10",
+    "agreement",
+    "figure_07",
+)
+HERE = Path(__file__).parent
+
+
+def one(name: str, out: Path) -> tuple[str, int, str, float]:
+    """Its name, exit code, what it said, and the seconds it took."""
+    started = time.perf_counter()
+    command = [sys.executable, str(HERE / f"{name}.py"), "--out", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return name, done.returncode, done.stdout + done.stderr, time.perf_counter() - started
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=common.OUT, help="folder for JSON and PNG")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time")
+    options = parser.parse_args()
+    started = time.perf_counter()
+    warm_up(Console(stderr=True))  # once, for all of them
+    failed = []
+    with ThreadPoolExecutor(options.jobs) as pool:
+        for name, code, said, seconds in pool.map(lambda name: one(name, options.out), ALL):
+            print(said.rstrip(), f"({name}: {seconds:.0f} s)", sep="\n", flush=True)
+            failed += [name] if code else []
+    print(f"{options.out}: {len(ALL)} experiments in {time.perf_counter() - started:.0f} s")
+    if failed:
+        print(f"FAILED: {', '.join(failed)}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

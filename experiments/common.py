@@ -1,0 +1,45 @@
+"""What all experiments share: `--out`, colours, and the file of results beside the pictures.
+
+An experiment is a module with NAME, PAPER (what the paper printed) and `run(out, ...)`, which draws
+its pictures into `out` and returns what `written` gives. Importing this module first makes the
+benchmarks importable, whose measurements the experiments use.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+OFFICE = [ROOT / "examples" / "office" / f"robot{i}" for i in (1, 2, 3)]
+OUT = Path("out/figures")
+INK, BLUE, RED, ORANGE, GREEN = "#1a1a1a", "#2166d1", "#d7301f", "#e08214", "#1d9a3c"
+Row = dict[str, Any]
+
+sys.path.append(str(ROOT / "bench"))  # scenes, traffic and costs that are measured there too
+
+
+def written(out: Path, name: str, paper: str, measured: list[str], **data: Any) -> Row:
+    """Write NAME.json: what the paper printed, what was measured in words, and all numbers."""
+    result = {"experiment": name, "paper": paper, "measured": measured, **data}
+    out.mkdir(parents=True, exist_ok=True)
+    (out / f"{name}.json").write_text(json.dumps(result, indent=1) + "\n")
+    return result
+
+
+def main(run: Callable[..., Row], *options: tuple[str, type, Any, str]) -> None:
+    """The command line of one experiment: `--out DIR`, and further (name, type, default, help)."""
+    parser = argparse.ArgumentParser(description=sys.modules["__main__"].__doc__)
+    parser.add_argument("--out", type=Path, default=OUT, help="folder for JSON and PNG")
+    for name, kind, default, text in options:
+        described = f"{text} (default {default})"
+        parser.add_argument(f"--{name}", type=kind, default=default, help=described)
+    arguments = vars(parser.parse_args())
+    arguments["out"].mkdir(parents=True, exist_ok=True)
+    result = run(**arguments)
+    for line in result["measured"]:
+        print(f"{result['experiment']}: {line}")

@@ -1,0 +1,41 @@
+"""Files of poses: TUM's lines, which most SLAMs can write."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ...model import RecordingError
+from ._poses import Trajectory, matrix
+from ._source import read_rows
+
+_NANOSECONDS = 1e14  # what is larger is no stamp in s: ORB-SLAM3 writes EuRoC's ns as they are
+
+
+def numbers(file: Path, number: int, words: list[str], count: int) -> list[float]:
+    """The finite numbers of a line. Raises RecordingError where they are not `count`."""
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        values = []
+    if len(values) != count or not np.isfinite(values).all():
+        raise RecordingError(f"{file}, line {number}: {count} finite numbers are wanted")
+    return values
+
+
+def read_tum(file: Path) -> Trajectory:
+    """`stamp x y z qx qy qz qw` a line, the stamp in s, or in ns as ORB-SLAM3 writes it for EuRoC.
+
+    Raises RecordingError.
+    """
+    out = Trajectory()
+    for number, words in read_rows(file):
+        stamp, *values = numbers(file, number, words, 8)
+        pose = matrix(np.array(values[:3]), np.array(values[3:]))
+        if pose is None:
+            raise RecordingError(f"{file}, line {number}: the quaternion is not of length 1")
+        out.add(stamp / 1e9 if stamp > _NANOSECONDS else stamp, pose)
+    if not len(out):
+        raise RecordingError(f"{file}: no poses; a line `stamp x y z qx qy qz qw` each is wanted")
+    return out

@@ -1,0 +1,140 @@
+"""What ORB-SLAM3 has mapped, as text: the trajectory of its key frames and its map points.
+
+A map to share at once: each key frame is a cycle, and has the points that are nearest to it of
+those that lie before it. Which key frames saw a point is not in these files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from ...model import Cycle, Floats, RecordingError, Uint8s
+from ._source import Description, Item, Options, Skips, checked, folder_name, read_rows
+from ._trajectory import read_tum
+from .scans import READERS
+
+UNDERSTANDS = (
+    "a map of ORB-SLAM3 (KeyFrameTrajectory.txt and MapPoints.txt, .csv, .xyz, .ply, .pcd)"
+)
+_TRAJECTORIES = ("KeyFrameTrajectory.txt", "kf_*.txt")
+_POINTS = {"mappoints", "referencemappoints", "pointcloud"}
+_TEXTS = (".txt", ".csv", ".xyz")
+_CONE = np.cos(np.radians(50.0))  # half of a wide lens: what lies further aside was not seen
+_BLOCK = 1 << 21  # pairs of a point and a key frame at a time
+_NOBODY = -1
+
+
+def matches(path: Path) -> bool:
+    """Whether this is a folder with a trajectory of key frames and map points."""
+    return path.is_dir() and _files(path) is not None
+
+
+def open(path: Path, options: Options) -> OrbSlamMap:  # noqa: A001
+    """Open a map. Raises RecordingError."""
+    return OrbSlamMap(path, options)
+
+
+def describe(path: Path, options: Options) -> Description:
+    """Key frames and points."""
+    source = open(path, options)
+    items = (
+        Item(source.files[0].name, "poses of the camera", len(source), "cycles"),
+        Item(source.files[1].name, "3D points", source.count, "points"),
+    )
+    notes = ("of a single camera the scale is ORB-SLAM3's own, not metres",)
+    return Description("map of ORB-SLAM3", items, len(source), None, (*source.notes, *notes))
+
+
+class OrbSlamMap:
+    """The key frames of a map as cycles. files: the two; count: its points; dropped: of them,
+    those that no key frame has before it."""
+
+    def __init__(self, path: Path, options: Options) -> None:
+        found = _files(path)
+        if found is None:
+            raise RecordingError(f"{path}: no KeyFrameTrajectory.txt and MapPoints.txt in it")
+        self.name, self.files, self._options = folder_name(path), found, options
+        self.skips = Skips(options.keep_going)
+        self._stamps, self._poses = read_tum(found[0]).all()
+        points, colors = self._read(found[1])
+        seen = np.isfinite(points).all(axis=1)
+        self._points, self._colors = points[seen], None if colors is None else colors[seen]
+        self.count = len(points)
+        if not len(self._points):
+            raise RecordingError(f"{found[1]}: no points; save the map after it has been built")
+        self._owner = _owners(self._points, self._poses, options)
+        self.dropped = int((self._owner == _NOBODY).sum()) + int((~seen).sum())
+        self.notes = (f"{self.dropped} of {self.count} points before no key frame",)
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def __iter__(self) -> Iterator[Cycle]:
+        for i, (stamp, pose) in enumerate(zip(self._stamps, self._poses, strict=True)):
+            rows = np.flatnonzero(self._owner == i)
+            if len(rows) > self._options.max_features:
+                most = self._options.max_features
+                rows = rows[np.arange(most) * len(rows) // most]
+            places = (self._points[rows] - pose[:3, 3]) @ pose[:3, :3]
+            colors = None if self._colors is None else self._colors[rows]
+            cycle = Cycle(float(stamp), pose, places, ids=rows.astype(np.uint64), colors=colors)
+            try:
+                cycle = checked(cycle, self.files[1])
+            except RecordingError as error:
+                self.skips.note(error)
+                continue
+            yield cycle
+
+    def _read(self, file: Path) -> tuple[Floats, Uint8s | None]:
+        if file.suffix.lower() in READERS:
+            return READERS[file.suffix.lower()](file)
+        rows: list[list[float]] = []
+        for number, words in read_rows(file):
+            try:
+                rows.append(_place(words))
+            except ValueError:
+                names = not rows and all(word.isalpha() for word in words)  # of the columns
+                if not names:
+                    where = f"{file}, line {number}"
+                    self.skips.note(RecordingError(f"{where}: `x y z` is wanted, not {words[:3]}"))
+        return np.array(rows, np.float64).reshape(-1, 3), None
+
+
+def _place(words: list[str]) -> list[float]:
+    """Raises ValueError where they do not begin with three numbers."""
+    x, y, z = (float(word) for word in words[:3])
+    return [x, y, z]
+
+
+def _files(path: Path) -> tuple[Path, Path] | None:
+    """The trajectory of the key frames and the points."""
+    trajectories = [file for name in _TRAJECTORIES for file in sorted(path.glob(name))]
+    suffixes = {*_TEXTS, ".ply", ".pcd"}
+    points = [
+        file
+        for file in sorted(path.iterdir())
+        if file.suffix.lower() in suffixes and file.stem.lower().replace("_", "") in _POINTS
+    ]
+    return (trajectories[0], points[0]) if trajectories and points else None
+
+
+def _owners(points: Floats, poses: Floats, options: Options) -> npt.NDArray[np.int64]:
+    """(N,) for points (N, 3): the nearest of the key frames (M, 4, 4) that have it before them."""
+    most = np.inf if options.max_depth is None else options.max_depth
+    out = np.full(len(points), _NOBODY, np.int64)
+    step = max(1, _BLOCK // len(poses))
+    with np.errstate(over="ignore", invalid="ignore"):
+        for i in range(0, len(points), step):
+            away = points[i : i + step, None] - poses[None, :, :3, 3]
+            distance = np.sqrt((away**2).sum(axis=2))
+            depth = (away * poses[None, :, :3, 2]).sum(axis=2)
+            seen = (depth > _CONE * distance) & (distance <= most)
+            distance = np.where(seen, distance, np.inf)
+            nearest = distance.argmin(axis=1)
+            near = np.isfinite(distance[np.arange(len(nearest)), nearest])
+            out[i : i + step][near] = nearest[near]
+    return out
