@@ -137,7 +137,7 @@ def test_every_option_that_a_page_names_exists() -> None:
         stack += getattr(command, "commands", {}).values()
     others = {"--runs"}  # of bench/reliability.py
     for page in PAGES:
-        if page.name in ("fuzzing.md", "quality.md", "install.md"):
+        if page.name in ("fuzzing.md", "quality.md", "install.md", "experiments.md"):
             continue
         named = set(re.findall(r"`(--[a-z][\w-]+)", page.read_text()))
         assert named <= known | others, f"{page.name}: {named - known - others}"
