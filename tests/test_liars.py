@@ -62,6 +62,14 @@ def test_the_honest_agree_whatever_one_does(kind: str) -> None:
     assert attempt(scenario, 3) is None, "every invariant holds, and all agree"
 
 
+@pytest.mark.parametrize("kind", sorted(set(LIARS) - set(SAYING)))
+def test_many_of_a_kind_do_not_feed_each_other(kind: str) -> None:
+    """Three of six: no storm of messages, and agreement, in bounded time."""
+    few = msgspec.structs.replace(ROOM.sensor, points=10)
+    scenario = room(kind, 3, seconds=3.0, sensor=few)
+    assert attempt(scenario, 1) is None
+
+
 @pytest.mark.parametrize("kind", SAYING)
 @pytest.mark.parametrize("witnesses", [2, 3])
 def test_what_only_liars_say_is_confirmed_from_witnesses_liars_on(
@@ -114,6 +122,28 @@ def test_a_refusal_says_why(kind: str, reason: str) -> None:
     few = msgspec.structs.replace(ROOM.sensor, points=20)
     report = played(room(kind, 1, seconds=8.0, sensor=few))[1]
     assert report.rejected.get(reason, 0) > 0, report.rejected
+
+
+def test_spoilt_work_is_refused_before_the_signature_is_looked_at() -> None:
+    few = msgspec.structs.replace(ROOM.sensor, points=20)
+    scenario = room("wrong-prover", 1, seconds=5.0, sensor=few)
+    worked = msgspec.structs.replace(
+        scenario.config, transaction=TransactionConfig(proof_of_work_bits=2)
+    )
+    report = played(msgspec.structs.replace(scenario, config=worked))[1]
+    assert report.rejected.get("proof of work missing", 0) > 3, report.rejected
+    assert report.rejected.get("signature does not match", 0) > 3
+
+
+def test_a_replayer_sends_what_others_said() -> None:
+    replayer, agent = make_liar("replayer", 0), Agent(Identity.from_seed(bytes(32)), ROOM.config)
+    replayer.hear(b"of another")
+    agent.tick(0.0)
+    sent = {out.data for out in replayer.send(agent, agent.outbox(), 0.0)}
+    assert b"of another" in sent and len(sent) == 2
+    agent.tick(5.0)
+    again = replayer.send(agent, agent.outbox(), 5.0)
+    assert len(again) > 10 and sent & {out.data for out in again}
 
 
 def test_a_fork_is_cut_on_every_robot() -> None:

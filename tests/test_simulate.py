@@ -16,6 +16,7 @@ from dagmap import Agent
 from dagmap.cli import main
 from dagmap.io.sources import save_cycles
 from dagmap.model import ConfigError
+from dagmap.sim import truth
 from dagmap.sim.mission import Mission
 from dagmap.sim.scenario import load_scenario
 from dagmap.sim.sweep import attempt, timeline_of
@@ -68,7 +69,18 @@ def test_a_run_prints_what_it_gave(small: Path) -> None:
     assert code == 0 and "simulating" not in out
     for words in ("small, seed 3", "3, 0 of them liars", "on all", "times the least needed"):
         assert words in out
-    assert "agreeing" in err or "simulating" in err
+    assert "comparing maps" in err
+
+
+def test_the_truth_is_named_with_what_it_needs(
+    small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = " ".join(dagmap("simulate", small)[1].split())
+    assert "accuracy" in out and "completeness" in out
+    for module in (sys.modules["dagmap.cli.simulate"], truth):
+        monkeypatch.setattr(module, "find_spec", lambda name: None)
+    code, out, _ = dagmap("simulate", small)
+    assert code == 0 and "dagmap[evaluate]" in out and "completeness" not in out
 
 
 def test_json_is_one_object_with_all_figures(small: Path) -> None:

@@ -30,7 +30,7 @@ from dagmap.sim.invariants import Invariants
 from dagmap.sim.liars import LIARS
 from dagmap.sim.mission import Mission
 from dagmap.sim.network import Link, Network, Partition, Position
-from dagmap.sim.robot import Clock, Crashed, Disk, Happening, Recording, Restarted, Robot
+from dagmap.sim.robot import Clock, Costs, Crashed, Disk, Happening, Recording, Restarted, Robot
 from dagmap.sim.scenario import Chaos, Clocks, Liars, Scenario, load_scenario
 from dagmap.sim.sensor import SensorConfig
 from dagmap.sim.timeline import Timeline
@@ -141,7 +141,7 @@ def test_duplicates_arrive_each_at_its_own_time() -> None:
 
 
 def test_bandwidth_makes_messages_wait_and_a_full_queue_drops_them() -> None:
-    link = Link(delay=(0.0, 0.0), bandwidth=1000.0, queue=250)
+    link = Link(delay=(0.0, 0.0), bandwidth=1000.0, queue=300)
     network = Network(link, 1)
     times = arrivals(network, 5)  # 100 bytes take 0.1 s
     assert [at for [at] in times[:3]] == pytest.approx([0.1, 0.2, 0.3]) and times[3:] == [[], []]
@@ -149,7 +149,24 @@ def test_bandwidth_makes_messages_wait_and_a_full_queue_drops_them() -> None:
     assert network.send("c", ["b"], 100, 0.0) == [(0.1, "b")]  # everybody has a radio
     [(at, _)] = network.send("a", ["b"], 100, 0.2)  # the queue has emptied a little
     assert at == pytest.approx(0.4)
+    [(at, _)] = network.send("d", ["b"], 10**6, 0.0)  # into an empty radio fits any message
+    assert at == pytest.approx(1000.0)
+    assert network.send("d", ["b"], 1, 0.0) == []  # and then none
     assert network.send("a", ["b", "c"], 100, 9.0) == [(9.1, "b"), (9.1, "c")]  # one broadcast
+
+
+def test_who_hears_a_message_follows_from_when_it_leaves() -> None:
+    def where(name: str, now: float) -> Position:
+        return (0.0, 0.0, 0.0) if name == "a" else (now, 0.0, 0.0)
+
+    slow = Link(delay=(0.0, 0.0), bandwidth=100.0)
+    cut = Partition(start=1.5, end=3.5, robots=("b",))
+    network = Network(slow, 1, [cut])
+    sent = [network.send("a", ["b"], 100, 0.0) for _ in range(5)]
+    assert sent == [[(1.0, "b")], [], [], [(4.0, "b")], [(5.0, "b")]]
+    assert network.send("c", ["b"], 300, 2.0) == [(5.0, "b")]  # queued within, leaves after it
+    near = Network(msgspec.structs.replace(slow, reach=2.5), 1, where=where)
+    assert [len(near.send("a", ["b"], 100, 0.0)) for _ in range(4)] == [1, 1, 0, 0]
 
 
 def test_reach_follows_the_robots() -> None:
@@ -252,6 +269,23 @@ def test_what_was_synced_survives_and_what_was_not_is_gone(moment: str) -> None:
     assert a.own == {tx.id for tx in chain.main}
 
 
+def test_a_crash_before_the_sync_loses_something(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It waits for a step in which there is something to lose."""
+    lost, plain = [], Disk.crash
+
+    def crash(self: Disk) -> list[bytes]:
+        gone = plain(self)
+        lost.append(len(gone))
+        return gone
+
+    monkeypatch.setattr(Disk, "crash", crash)
+    faults = [(1.05, "r00"), (2.31, "r01"), (3.77, "r02")]
+    crashes = tuple(Crash(robot=n, at=at, moment="unsynced") for at, n in faults)
+    for seed in range(4):
+        assert Mission(changed(CALM, crashes=crashes), seed).play() is not None
+    assert len(lost) >= 9 and min(lost) > 0
+
+
 def test_a_robot_that_is_down_hears_and_says_nothing() -> None:
     mission = Mission(changed(CALM, crashes=(Crash(robot="r01", at=2.05, down=2.0),)), 1)
     robot = mission.fleet.robots["r01"]
@@ -312,6 +346,25 @@ def test_divergence_rises_in_a_partition_and_ends_at_zero() -> None:
     apart = dict(report.divergence)
     assert apart[1.0] < apart[3.0] < apart[5.0] > 0.5 and report.divergence[-1][1] < apart[5.0]
     assert report.agreed
+
+
+def test_robots_agree_when_they_have_folded_what_they_know() -> None:
+    """So small a step that maps lag behind the ledgers: agreement in knowledge comes first."""
+    ledger = msgspec.structs.replace(CALM.config.ledger, fold_per_tick=3)
+    config = msgspec.structs.replace(CALM.config, ledger=ledger)
+    slow = changed(CALM, config=config, seconds=5.05)
+    mission = Mission(slow, 1)
+    stages: list[str] = []
+    report = mission.run(lambda now: stages.append(mission.stage))
+    assert all(robot.agent.settled for robot in mission.honest)
+    assert report.agreed and report.agreement_s is not None and report.agreement_s < 0.1
+    assert report.map_agreement_s is not None and report.map_agreement_s > 1.0
+    assert list(dict.fromkeys(stages)) == ["simulating", "agreeing", "comparing maps"]
+    mission = Mission(changed(slow, patience=0.5), 1)
+    assert mission.play() is None, "knowing the same is not enough"
+    quick = Mission(changed(CALM, seconds=5.05), 1).run()
+    assert quick.agreement_s == report.agreement_s
+    assert quick.map_agreement_s is not None and quick.map_agreement_s < 0.3
 
 
 def test_agreement_counts_from_when_nothing_stood_in_its_way() -> None:
@@ -427,6 +480,7 @@ BAD = {
     "[clocks]\noffset = -1.0": "offset",
     "[clocks]\noffset = inf": "offset",
     "[clocks]\ndrift = 0.5": "drift",
+    "[costs]\nsent = -1.0": "Costs: sent",
     "[chaos]\ncrashes = -1": "crashes",
     "[chaos]\npartitions = -1": "partitions",
     "[chaos]\ndown = [2.0, 1.0]": "down",
@@ -502,6 +556,7 @@ TABLES = {
     "`[motion]`": MotionConfig,
     "`[link]`": Link,
     "`[clocks]`": Clocks,
+    "`[costs]`": Costs,
     "`[chaos]`": Chaos,
     "`[[partitions]]`": Partition,
     "`[[crashes]]`": Crash,

@@ -7,10 +7,12 @@ import os
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 
 import msgspec
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -66,7 +68,7 @@ class Simulate:
                 lambda now: progress.update(
                     task,
                     completed=min(round(now), round(scenario.seconds)),
-                    description="simulating" if now < scenario.seconds else "agreeing",
+                    description=mission.stage,
                 )
             )
         if self.timeline is not None:
@@ -141,12 +143,14 @@ def _show(report: Report) -> None:
 
 def _rows(report: Report) -> list[tuple[str, str]]:
     agreed = "never" if report.agreement_s is None else f"{report.agreement_s:.2f} s"
+    folded = "never" if report.map_agreement_s is None else f"{report.map_agreement_s:.2f} s"
     ideal = "" if report.ideal_s is None else f" (a flood without loss: {report.ideal_s:.2f} s)"
     over = report.bytes_carried / max(1, report.bytes_minimum)
     states = ", ".join(f"{report.map[s.name.lower()]:,} {s.name.lower()}" for s in State)
     rows = [
         ("robots", f"{report.robots}, {report.liars} of them liars"),
         ("agreement after the last news", agreed + ideal),
+        ("maps alike after the last news", folded),
         ("digest", f"{report.digest[:16]}... on all" if report.agreed else "THE ROBOTS DISAGREE"),
         ("map", f"{report.map['nodes']:,} nodes: {states}"),
         ("transactions", f"{report.transactions:,}"),
@@ -159,6 +163,9 @@ def _rows(report: Report) -> list[tuple[str, str]]:
     ]
     if report.quality is not None:
         rows.append(("against the truth", _quality(report.quality)))
+    elif find_spec("scipy") is None:
+        remedy = "not compared: scipy is missing; pip install 'dagmap[evaluate]'"
+        rows.append(("against the truth", escape(remedy)))
     if report.lies is not None:
         rows += _lies(report.lies)
     return rows + [("refused", f"{count:,} x {why}") for why, count in report.rejected.items()]
@@ -166,7 +173,9 @@ def _rows(report: Report) -> list[tuple[str, str]]:
 
 def _quality(quality: Quality) -> str:
     shares = f"precision {quality.precision:.3f}, recall {quality.recall:.3f}"
-    return f"accuracy {quality.accuracy * 100:.1f} cm; {shares}, F-score {quality.f_score:.3f}"
+    near = f"accuracy {quality.accuracy * 100:.1f} cm"
+    far = f"completeness {quality.completeness * 100:.1f} cm"
+    return f"{near}, {far}; {shares}, F-score {quality.f_score:.3f}"
 
 
 def _lies(lies: Lies) -> list[tuple[str, str]]:

@@ -47,7 +47,8 @@ Check: TypeAlias = Callable[[Robot], None]
 class Crash(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A robot's process dies at `at` (s) and is back `down` seconds later.
 
-    moment: "between" two steps; in the next step before the disk was synced; or after, "unsent".
+    moment: "between" two steps; "unsynced", in the next one that has something to store, before the
+    disk was synced; or "unsent", in the next one after that, before it has sent.
     """
 
     robot: str
@@ -181,9 +182,10 @@ class Fleet:
         return robot, what
 
     def agrees(self, robots: Iterable[Robot] | None = None) -> bool:
-        """Whether all ledgers count the same transactions and nothing waits to be sent."""
+        """Whether all ledgers count the same transactions, nothing waits to be sent, and all that
+        is known is folded."""
         agents = [robot.agent for robot in (self.robots.values() if robots is None else robots)]
-        if any(agent.holds_back or agent.searching for agent in agents):
+        if any(agent.holds_back or agent.searching or not agent.settled for agent in agents):
             return False
         first = _ends(agents[0]) if agents else {}
         return all(_ends(agent) == first for agent in agents[1:])
@@ -205,6 +207,8 @@ class Fleet:
         robot.bytes_received += len(data)
         if self._on_event is not None:
             self._on_event(robot, Received(len(data)))
+        if robot.liar is not None:
+            robot.liar.hear(data)
         self._after(robot, robot.agent.receive(data, robot.clock.at(self.now)))
 
     def _observe(self, robot: Robot, what: _Seen) -> None:
@@ -239,7 +243,7 @@ class Fleet:
                 robot.transactions += 1
                 robot.issued += event.features
                 robot.issued_at.append((self.now, event.features))
-        if robot.doom == "unsynced":
+        if robot.doom == "unsynced" and robot.disk.unsynced:
             return self._die(robot, robot.doom)
         robot.disk.sync()
         if robot.doom == "unsent":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,13 +11,18 @@ from ..agent import Agent
 from ..consensus import Consensus
 from ..graph import AdjacencyDag
 from ..identity import signature_holds
-from ..model import AuthorId, Int64s, State, TransactionId
-from ..sync import MAX_PEERS
+from ..model import AuthorId, Int64s, Issued, State, TransactionId
 from ..transaction import Transaction, signed_part
 from .fleet import Fleet
 from .robot import Happening, Observed, Robot
 from .truth import transactions_anew
 
+# What a robot may hold at most, stated here once more and not taken from the code that is checked.
+_PEERS = 256  # other robots
+_HEADS = 1800  # of one of them
+_ASKED = 3600  # chains that were asked about
+_SENT = 64  # announcements that may be echoed
+_STORM = 4000  # events of one robot in a simulated second: beyond, they never end
 _EVERY = 200  # events of a robot between two looks at the whole map
 _MOST = np.iinfo(np.int64).max
 
@@ -36,6 +42,7 @@ class _Looked:
     agent: Agent
     events: int = 0
     held: int = 0  # transactions
+    n_c: int = 0  # the largest so far
     chains: dict[AuthorId, int] = field(default_factory=dict)
 
 
@@ -48,18 +55,21 @@ class Invariants:
     def __init__(self) -> None:
         self.fleet: Fleet | None = None
         self._looked: dict[str, _Looked] = {}
-        self._observed: set[str] = set()
+        self._grown: set[str] = set()  # robots whose graph may have changed
         self._signed: set[TransactionId] = set()
         self._robot = ""
+        self._second = 0  # of simulated time
+        self._busy: Counter[str] = Counter()  # events in it
 
     def saw(self, robot: Robot, happening: Happening) -> None:
-        if isinstance(happening, Observed):
-            self._observed.add(robot.name)
+        if isinstance(happening, Observed | Issued):
+            self._grown.add(robot.name)
 
     def __call__(self, robot: Robot) -> None:
+        self._robot = robot.name
+        self._storm()
         if not robot.honest:
             return
-        self._robot = robot.name
         looked = self._looked.get(robot.name)
         if looked is None or looked.agent is not robot.agent:  # it was restarted
             self._nothing_lost(robot)
@@ -67,9 +77,12 @@ class Invariants:
         looked.events += 1
         self._bounds(robot.agent)
         self._ledger(robot.agent, looked)
-        if robot.name in self._observed:
-            self._observed.discard(robot.name)
-            self._graph(robot.agent.observing.graph, robot.agent.config.graph.n_c)
+        n_c = robot.agent.steering.controller.n_c  # what the graph is told to keep to
+        looked.n_c = max(looked.n_c, n_c)
+        self._require(n_c <= robot.agent.config.graph.n_c_max, "N_c is too large", f"{n_c}")
+        if robot.name in self._grown:
+            self._grown.discard(robot.name)
+            self._graph(robot.agent.observing.graph, n_c, looked.n_c)
         if looked.events % _EVERY == 0:
             self._map(robot.agent)
 
@@ -99,6 +112,16 @@ class Invariants:
             now = self.fleet.now if self.fleet is not None else 0.0
             raise Violation(name, self._robot, now, detail)
 
+    def _storm(self) -> None:
+        """Messages may cause messages, but not more and more of them: the run would never end."""
+        second = int(self.fleet.now) if self.fleet is not None else 0
+        if second != self._second:
+            self._second = second
+            self._busy.clear()
+        self._busy[self._robot] += 1
+        count = self._busy[self._robot]
+        self._require(count <= _STORM, "a storm", f"{count} events within a second")
+
     def _nothing_lost(self, robot: Robot) -> None:
         """What was stored and told of is there after a restart, and the own chain goes on."""
         held = {tx.id for tx in robot.agent.ledger}
@@ -122,7 +145,13 @@ class Invariants:
         self._require(sizes.waiting_bytes <= limits.waiting_bytes, "memory", f"{sizes}")
         left = sizes.waiting_bytes or sizes.waited_for
         self._require(bool(sizes.waiting) or not left, "memory", f"nothing waits, but {sizes}")
-        self._require(len(agent.sync.peers) <= MAX_PEERS, "memory", "peers")
+        ids = limits.waiting_transactions * (agent.config.transaction.max_references + 1)
+        most_of = {"peers": _PEERS, "_asked": _ASKED, "_sent_at": _SENT, "_asked_ids": ids}
+        for name, most in most_of.items():
+            size = len(getattr(agent.sync, name))
+            self._require(size <= most, "memory", f"{name}: {size}, at most {most}")
+        heads = max((len(peer.heads) for peer in agent.sync.peers.values()), default=0)
+        self._require(heads <= _HEADS, "memory", f"heads of a peer: {heads}")
 
     def _ledger(self, agent: Agent, looked: _Looked) -> None:
         """Chains are unbroken, dated as they must be, and signed; nothing leaves."""
@@ -151,8 +180,11 @@ class Invariants:
             self._require(holds, "a signature is false", repr(tx))
             self._signed.add(tx.id)
 
-    def _graph(self, graph: AdjacencyDag, n_c: int) -> None:
-        """Acyclic, at most N_c children, E as it must be, validity the sum of the parents'."""
+    def _graph(self, graph: AdjacencyDag, n_c: int, largest: int) -> None:
+        """Acyclic, at most N_c children, E as it must be, validity the sum of the parents'.
+
+        n_c: now; largest: that it ever was, since what was inserted under it stays.
+        """
         parents, taken = graph.parents(), graph.parents_taken()
         ids, here = np.arange(len(graph)), graph.alive() | graph.issued()
         self._require(bool((parents < ids[:, None]).all()), "the graph has a cycle", "")
@@ -160,7 +192,7 @@ class Invariants:
         children = graph.children_count()
         self._require(bool((counted == children)[here].all()), "children are miscounted", "")
         self._require(
-            bool((children <= n_c).all()), "too many children", f"{children.max(initial=0)}"
+            bool((children <= largest).all()), "too many children", f"{children.max(initial=0)}"
         )
         terminals = np.flatnonzero(graph.alive() & (counted < n_c))
         self._require(np.array_equal(graph.terminals(), terminals), "E is wrong", "")

@@ -10,6 +10,7 @@ import random
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 
@@ -17,10 +18,13 @@ from .. import messages, transaction
 from ..agent import Agent
 from ..identity import Identity
 from ..messages import Head, Heads, Transactions
-from ..model import ConfigError, Cycle, Floats, Outgoing
+from ..model import ConfigError, Cycle, Floats, Outgoing, Reason
 from ..payload import Payload
+from ..wire import Refusal
 
-_BURST = 20  # messages that a noisy liar adds to each step in which it sends
+_BURST = 20  # messages that a noisy liar sends at a time
+_PAUSE = 0.2  # s between two bursts, or liars that answer each other's noise would never stop
+_CAPTURED = 500  # messages that a replayer keeps
 
 
 class Honest:
@@ -32,8 +36,29 @@ class Honest:
     def cycle(self, cycle: Cycle, now: float) -> Cycle:
         return cycle
 
+    def hear(self, data: bytes) -> None:
+        """A message has arrived."""
+
     def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:
         return outgoing
+
+
+class Noisy(Honest):
+    """Sends bursts of messages, with a pause after each: a radio has its limit, too."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed)
+        self._rests_until = 0.0
+
+    def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:
+        if not outgoing or now < self._rests_until:
+            return outgoing
+        self._rests_until = now + _PAUSE
+        return outgoing + [self.noise(agent) for _ in range(_BURST)]
+
+    def noise(self, agent: Agent) -> Outgoing:
+        """One of a burst."""
+        raise NotImplementedError
 
 
 class Forger(Honest):
@@ -55,7 +80,7 @@ class Eraser(Honest):
 
 
 class Splitter(Honest):
-    """Surrounds what it sees with copies, so that the observations of others find many twins."""
+    """Surrounds what it sees with six copies, so that others' observations find many twins."""
 
     def cycle(self, cycle: Cycle, now: float) -> Cycle:
         points = _points(cycle)
@@ -65,7 +90,7 @@ class Splitter(Honest):
 
 
 class WrongFrame(Honest):
-    """Is half a metre and ten degrees from where it believes to be."""
+    """Has a frame turned by ten degrees about the fleet's origin and moved by half a metre."""
 
     def cycle(self, cycle: Cycle, now: float) -> Cycle:
         c, s = np.cos(np.radians(10)), np.sin(np.radians(10))
@@ -74,6 +99,23 @@ class WrongFrame(Honest):
         if moved is not None:
             moved = (moved[0], wrong @ np.asarray(moved[1], np.float64))
         return replace(cycle, pose=wrong @ np.asarray(cycle.pose, np.float64), moved=moved)
+
+
+class Outsider(Honest):
+    """Reports true points, but from a place far behind it, so that walls lie in between.
+
+    Where it is the first that sees a place, what ends at those walls speaks against the place.
+    """
+
+    BACK = 4.5  # m
+
+    def cycle(self, cycle: Cycle, now: float) -> Cycle:
+        pose = np.array(cycle.pose, np.float64)
+        points = _points(cycle)
+        ahead = np.array([*pose[:2, 0], 0.0])
+        back = self.BACK * ahead / max(float(np.linalg.norm(ahead)), 1e-9)
+        pose[:3, 3] -= back
+        return replace(_with_points(cycle, points + back @ pose[:3, :3]), pose=pose, moved=None)
 
 
 class Forker(Honest):
@@ -108,8 +150,21 @@ class BackDater(Honest):
         return due
 
 
+class EarlyOutsider(BackDater):
+    """An outsider that refers to nobody, so that it is the first that sees a place."""
+
+    LATE = 0.0
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed)
+        self._outsider = Outsider(seed)
+
+    def cycle(self, cycle: Cycle, now: float) -> Cycle:
+        return self._outsider.cycle(cycle, now)
+
+
 class FalseDater(Honest):
-    """Claims Lamport times that do not follow from its references, low and high."""
+    """Claims Lamport times, low and high, that do not follow from its references; no true ones."""
 
     def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:
         out = []
@@ -125,43 +180,55 @@ class FalseDater(Honest):
         return out
 
 
-class Flooder(Honest):
+class Flooder(Noisy):
     """Sends transactions without end that refer to what does not exist, to fill every room."""
 
-    def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:
-        if not outgoing:
-            return outgoing
-        junk = (
-            _sealed(agent, self.random.randrange(1000, 1 << 30), self.random.randbytes(32), 7, ())
-            for _ in range(_BURST)
-        )
-        return outgoing + [_packed(agent, data) for data in junk]
+    def noise(self, agent: Agent) -> Outgoing:
+        number, previous = self.random.randrange(1000, 1 << 30), self.random.randbytes(32)
+        return _packed(agent, _sealed(agent, number, previous, 7, ()))
 
 
-class Replayer(Honest):
-    """Sends everything that it ever sent again and again."""
+class Replayer(Noisy):
+    """Sends messages of its own and of others, which it has captured, again and again."""
 
     def __init__(self, seed: int) -> None:
         super().__init__(seed)
-        self._sent: list[Outgoing] = []
+        self._captured: deque[bytes] = deque(maxlen=_CAPTURED)
+
+    def hear(self, data: bytes) -> None:
+        self._captured.append(data)
 
     def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:
-        self._sent += outgoing
-        if not outgoing:
-            return outgoing
-        return outgoing + [self.random.choice(self._sent) for _ in range(_BURST)]
+        self._captured.extend(sent.data for sent in outgoing)
+        return super().send(agent, outgoing, now)
+
+    def noise(self, agent: Agent) -> Outgoing:
+        return Outgoing(self.random.choice(self._captured))
+
+
+class ManyNamed(Noisy):
+    """Invents senders, each of which announces chains of robots that do not exist."""
+
+    HEADS = 20  # of one invented sender
+
+    def noise(self, agent: Agent) -> Outgoing:
+        heads = tuple(_invented(self.random) for _ in range(self.HEADS))
+        message = Heads(self.random.randrange(1 << 30), (), heads)
+        return Outgoing(messages.encode(message, agent.config, self.random.randbytes(8)))
 
 
 class WrongProver(Honest):
-    """Spoils signatures and proofs of work, and speaks in the name of others."""
+    """Spoils signatures and, where it is asked for, work, and speaks in the name of others."""
 
     def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:
         out = list(outgoing)
         for sent in outgoing:
             for tx in _own(agent, sent):
                 spoilt = bytearray(tx.data)
-                spoilt[-self.random.randrange(1, 69)] ^= 1 << self.random.randrange(8)
+                spoilt[-self.random.randrange(1, 65)] ^= 1 << self.random.randrange(8)
                 out.append(_packed(agent, bytes(spoilt)))
+                if agent.config.transaction.proof_of_work_bits:
+                    out.append(_packed(agent, _unworked(agent, tx.data)))
         return out + [_packed(agent, data) for data in self._in_the_name_of_others(agent)]
 
     def _in_the_name_of_others(self, agent: Agent) -> Iterator[bytes]:
@@ -200,14 +267,13 @@ class Babbler(Honest):
 
 
 class Withholder(Honest):
-    """Announces its own transactions, shows them to one robot only and answers no question."""
+    """Announces all it has, but sends transactions to one robot only, answers to others too."""
 
     def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:
         friend = min(agent.sync.peers, default=None)
         out = []
         for sent in outgoing:
-            told = isinstance(messages.parse(sent.data, agent.config)[1], Transactions)
-            if not told:
+            if not _is(agent, sent, Transactions):
                 out.append(sent)
             elif friend is not None:
                 out.append(Outgoing(sent.data, friend))
@@ -215,17 +281,16 @@ class Withholder(Honest):
 
 
 class Braggart(Honest):
-    """Announces chains that nobody has."""
+    """Announces longer chains than there are, and one of nobody, with each of its announcements."""
 
     def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:
-        if not outgoing:
-            return outgoing
+        if not any(_is(agent, sent, Heads) for sent in outgoing):
+            return outgoing  # to boast in answer to a boast would never end
         heads = tuple(
             Head(author, chain.end + self.random.randrange(1, 1 << 20), self.random.randbytes(8))
             for author, chain in agent.ledger.chains.items()
         )
-        invented = Head(self.random.randbytes(8), self.random.randrange(1, 99), bytes(8))
-        boast = Heads(self.random.randrange(1 << 30), (), (*heads, invented))
+        boast = Heads(self.random.randrange(1 << 30), (), (*heads, _invented(self.random)))
         data = messages.encode(boast, agent.config, agent.identity.author)
         return [*outgoing, Outgoing(data)]
 
@@ -235,6 +300,8 @@ LIARS: dict[str, type[Honest]] = {
     "eraser": Eraser,
     "splitter": Splitter,
     "wrong-frame": WrongFrame,
+    "outsider": Outsider,
+    "early-outsider": EarlyOutsider,
     "forker": Forker,
     "back-dater": BackDater,
     "false-dater": FalseDater,
@@ -244,6 +311,7 @@ LIARS: dict[str, type[Honest]] = {
     "babbler": Babbler,
     "withholder": Withholder,
     "braggart": Braggart,
+    "many-named": ManyNamed,
 }
 
 
@@ -252,6 +320,28 @@ def make_liar(kind: str, seed: int) -> Honest:
     if kind not in LIARS:
         raise ConfigError(f"liar {kind!r} is unknown; one of {', '.join(sorted(LIARS))} is wanted")
     return LIARS[kind](seed)
+
+
+def _is(agent: Agent, sent: Outgoing, kind: type) -> bool:
+    return isinstance(messages.parse(sent.data, agent.config)[1], kind)
+
+
+def _invented(chance: random.Random) -> Head:
+    """The end of a chain of a robot that does not exist."""
+    return Head(chance.randbytes(8), chance.randrange(1, 99), bytes(8))
+
+
+def _unworked(agent: Agent, data: bytes) -> bytes:
+    """A transaction with a nonce that the work was not done for."""
+    spoilt, at = bytearray(data), len(data) - 68
+    for nonce in count():
+        spoilt[at : at + 4] = nonce.to_bytes(4, "little")
+        try:
+            transaction.parse(bytes(spoilt), agent.config)
+        except Refusal as refusal:
+            if refusal.reason is Reason.PROOF_OF_WORK:
+                break
+    return bytes(spoilt)
 
 
 def _own(agent: Agent, sent: Outgoing) -> list[transaction.Transaction]:

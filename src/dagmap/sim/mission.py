@@ -11,12 +11,12 @@ from typing import TypeAlias
 
 import msgspec
 
-from ..model import Accepted, ConfigError, Cycle, Forked, Issued, Rejected, State
+from ..model import Accepted, ConfigError, Cycle, Forked, Issued, MapChanged, Rejected, State
 from ..worldmap import WorldMap
 from .fleet import Check, Fleet
 from .liars import make_liar
 from .network import Network, Position
-from .robot import Happening, Recording, Restarted, Robot, Source, Timed
+from .robot import Costs, Happening, Recording, Restarted, Robot, Source, Timed
 from .scenario import Scenario
 from .scene import Scene, Walker
 from .truth import Lies, Quality, judge_lies, judge_quality
@@ -36,6 +36,7 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     digest: str
     agreement_s: float | None  # see `Mission.play`
     agreement_periods: float | None  # the same in announcement periods
+    map_agreement_s: float | None  # the same until the last robot had folded it, too
     ideal_s: float | None  # what a flood without loss would take from then on
     simulated_s: float
     wall_s: float
@@ -101,10 +102,19 @@ class Mission:
         if not self._recordings:
             self._scene = self._build_scene()
         network = Network(scenario.link, seed, self.scenario.partitions, self._where)
-        self.fleet = Fleet(scenario.config, network, self._note, check=check, tick=scenario.tick)
+        self.fleet = Fleet(
+            scenario.config,
+            network,
+            self._note,
+            check=check,
+            tick=scenario.tick,
+            costs=scenario.costs if scenario.costs != Costs() else None,
+        )
         self._network = network
         self._divergence: list[tuple[float, float]] = []
         self._cause = self._effect = 0.0  # s: last honest news or return, and last word of any
+        self._folded = 0.0  # s: when a map changed last
+        self.stage = "simulating"  # for those who watch: what a run is at
         self._set_up()
 
     @property
@@ -115,10 +125,12 @@ class Mission:
         """Play the mission, let the fleet agree, measure. `told` hears how far the time is."""
         started = time.perf_counter()
         took = self.play(told)
-        return self._report(took, time.perf_counter() - started)
+        self._enter("comparing maps", told)
+        digests = {robot.agent.digest() for robot in self.honest if robot.up}
+        return self._report(took, digests, time.perf_counter() - started)
 
     def play(self, told: Told | None = None) -> float | None:
-        """Play the mission and let the fleet agree.
+        """Play the mission and let the fleet agree: all know the same, and have folded it.
 
         Returns how long that took, s: from when the last honest transaction was issued, the last
         partition over and the last robot there, to when the last robot knew. None: it has not.
@@ -135,8 +147,14 @@ class Mission:
             for name in [name for name, at in joining.items() if at <= self.fleet.now]:
                 self._join(name)
                 del joining[name]
+        self._enter("agreeing", told)
         while not self._quiet() and self.fleet.now < scenario.seconds + scenario.patience:
             self._pass(self.fleet.now + scenario.tick, told)
+
+    def _enter(self, stage: str, told: Told | None) -> None:
+        self.stage = stage
+        if told is not None:
+            told(self.fleet.now)
 
     def _settled(self) -> float:
         """When the last of what keeps robots from agreeing was over, s."""
@@ -185,6 +203,8 @@ class Mission:
             match happening:
                 case Accepted() | Forked():
                     self._effect = self.fleet.now
+                case MapChanged():
+                    self._folded = self.fleet.now
                 case Issued() | Restarted():
                     self._cause = self.fleet.now
                 case Rejected(reason):
@@ -213,8 +233,14 @@ class Mission:
         return max((total - least) / total for least in held) if total and held else 0.0
 
     def _quiet(self) -> bool:
+        """Whether all is over: every honest robot knows what the others know, and has folded it.
+
+        Each gets its tick after the last news: whether a map was read meanwhile changes nothing.
+        """
         honest = self.honest
         if any(robot.plays or not robot.up for robot in honest):
+            return False
+        if self.fleet.now < self._effect + self.scenario.tick:
             return False
         counts = {len(robot.agent.ledger.chains) for robot in honest}
         return len(counts) == 1 and self._apart() == 0.0 and self.fleet.agrees(honest)
@@ -247,9 +273,8 @@ class Mission:
             return None
         return judge_quality(world, self._walkers, self.honest, self._scene)
 
-    def _report(self, took: float | None, wall: float) -> Report:
+    def _report(self, took: float | None, digests: set[bytes], wall: float) -> Report:
         robots, honest = list(self.fleet.robots.values()), self.honest
-        digests = {robot.agent.digest() for robot in honest if robot.up}
         good = {robot.author for robot in honest}
         unique = {
             tx.id: len(tx.data) * (len(honest) - (tx.author in good))
@@ -267,6 +292,9 @@ class Mission:
             digest=min(digests).hex() if digests else "",
             agreement_s=took,
             agreement_periods=None if took is None else took / period,
+            map_agreement_s=None
+            if took is None
+            else max(0.0, max(self._effect, self._folded) - self._settled()),
             ideal_s=self._ideal(self._settled()),
             simulated_s=self.fleet.now,
             wall_s=wall,

@@ -24,7 +24,7 @@ class Link(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     duplicate: float = 0.0  # probability that it arrives twice
     reach: float | None = None  # m: robots further apart do not hear each other
     bandwidth: float | None = None  # bytes/s that one robot can send
-    queue: int = 1 << 20  # bytes that wait for their turn at most; the rest is dropped
+    queue: int = 1 << 20  # bytes that a radio holds at most, beyond one message; more is dropped
 
     def __post_init__(self) -> None:
         self._require(0 <= self.loss < 1, "loss", "a probability from 0 up to, not including, 1")
@@ -110,13 +110,16 @@ class Network:
     def send(
         self, sender: str, receivers: Iterable[str], size: int, now: float
     ) -> list[tuple[float, str]]:
-        """(time of arrival, receiver) of every copy that arrives. A broadcast is sent once."""
+        """(time of arrival, receiver) of every copy that arrives. A broadcast is sent once.
+
+        Who hears it follows from when it leaves the radio, not from when it was queued.
+        """
         leaves = self._transmit(sender, size, now)
         if leaves is None:
             return []
         link, chance = self.link, self._random
         copies = []
-        for receiver in self._hearing(sender, receivers, now):
+        for receiver in self._hearing(sender, receivers, leaves):
             for _ in range(1 + (link.duplicate > 0 and chance.random() < link.duplicate)):
                 self.carried += size
                 delay = chance.uniform(*link.delay)
@@ -131,7 +134,8 @@ class Network:
         if self.link.bandwidth is None:
             return now
         start = max(now, self._free_at.get(sender, now))
-        if (start - now) * self.link.bandwidth > self.link.queue:
+        held = (start - now) * self.link.bandwidth
+        if held and held + size > self.link.queue:
             self.dropped += 1
             return None
         self._free_at[sender] = start + size / self.link.bandwidth

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -40,6 +41,12 @@ class Costs(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     sent: float = 0.0
     merged: float = 0.0
 
+    def __post_init__(self) -> None:
+        for name in self.__struct_fields__:
+            if not 0 <= getattr(self, name) < math.inf:
+                value = getattr(self, name)
+                raise ConfigError(f"Costs: {name} = {value!r}, but a time of at least 0 is wanted")
+
     def of(self, work: Work) -> float:
         """Seconds."""
         return self.inserted * work.inserted + self.sent * work.sent + self.merged * work.merged
@@ -54,6 +61,11 @@ class Disk:
 
     def append(self, data: bytes) -> None:
         self._pending.append(data)
+
+    @property
+    def unsynced(self) -> int:
+        """Transactions that a crash would lose."""
+        return len(self._pending)
 
     def sync(self) -> None:
         self._safe += self._pending
@@ -103,6 +115,10 @@ class Liar(Protocol):
 
     def cycle(self, cycle: Cycle, now: float) -> Cycle:
         """What the agent is told instead of what the SLAM saw."""
+        ...
+
+    def hear(self, data: bytes) -> None:
+        """What has arrived, before the agent is told."""
         ...
 
     def send(self, agent: Agent, outgoing: list[Outgoing], now: float) -> list[Outgoing]:

@@ -16,7 +16,7 @@ from .building import SceneConfig
 from .fleet import Crash
 from .liars import LIARS
 from .network import Link, Partition
-from .robot import Clock
+from .robot import Clock, Costs
 from .sensor import SensorConfig
 from .walk import MotionConfig
 
@@ -91,6 +91,7 @@ class Scenario(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):
     recordings: tuple[str, ...] = ()
     link: Link = Link()
     clocks: Clocks = Clocks()
+    costs: Costs = Costs()
     chaos: Chaos = Chaos()
     liars: tuple[Liars, ...] = ()
     partitions: tuple[Partition, ...] = ()

@@ -20,7 +20,14 @@ from .timeline import Timeline
 T = TypeVar("T")
 
 _ATTEMPTS = 300  # runs that cutting a failure down may take
+_SHARES = (0.5, 0.75, 0.9, 0.97)  # of the seconds: each success begins anew, as in a bisection
+_BRIEF = 0.1  # s: shorter faults are not cut
+NO_AGREEMENT = "no agreement"
 _CHUNK = 8  # seeds that a process takes at a time
+
+
+class _TooLong(Exception):
+    """The timeline has more events than were asked for."""
 
 
 class Failure(msgspec.Struct, frozen=True, kw_only=True):
@@ -66,14 +73,17 @@ def sweep(
 
 
 def minimised(failure: Failure) -> Failure:
-    """The same failure with as few faults, liars, robots and seconds as it takes."""
+    """The same failure with as few faults, liars, robots, seconds and events as it takes.
+
+    A cut is kept where the timeline does not become longer by it.
+    """
     best, left = failure, _ATTEMPTS
     improved = True
     while improved and left > 0:
         improved = False
         for candidate in _simpler(best):
             left -= 1
-            found = attempt(candidate, best.seed)
+            found = _watched(candidate, best.seed, most=best.timeline)[0]
             if found is not None and found.name == best.name:
                 best, improved = found, True
                 break
@@ -83,21 +93,29 @@ def minimised(failure: Failure) -> Failure:
 
 
 def _watched(
-    scenario: Scenario, seed: int, recordings: dict[str, Iterable[Cycle]] | None = None
+    scenario: Scenario,
+    seed: int,
+    recordings: dict[str, Iterable[Cycle]] | None = None,
+    most: int | None = None,
 ) -> tuple[Failure | None, Timeline]:
+    """most: events of a timeline beyond which nobody wants to know of a failure."""
     invariants = Invariants()
     timeline = Timeline(lambda: mission.fleet.now)
 
     def on_event(robot: Robot, happening: Happening) -> None:
         invariants.saw(robot, happening)
         timeline(robot, happening)
+        if most is not None and len(timeline.lines) > most:
+            raise _TooLong
 
     mission = Mission(scenario, seed, recordings, on_event, invariants)
     invariants.fleet = mission.fleet
     try:
         if mission.play() is None:
-            raise Violation("no agreement", "the fleet", mission.fleet.now, "out of patience")
+            raise Violation(NO_AGREEMENT, "the fleet", mission.fleet.now, "out of patience")
         invariants.at_the_end(mission.honest)
+    except _TooLong:
+        return None, timeline
     except Violation as violation:
         name, detail = violation.name, str(violation)
     except Exception as error:  # noqa: BLE001  # whatever escapes from an agent breaks promise 5
@@ -133,14 +151,10 @@ def _attempt(item: tuple[Scenario, int]) -> Failure | None:
 def _simpler(failure: Failure) -> Iterator[Scenario]:
     """Scenarios with a little less in them, the largest cuts first."""
     full = failure.scenario
-    for seconds in (round(failure.at + 0.001, 3), round(full.seconds * 0.6, 3)):
-        if 0 < seconds < full.seconds:
-            yield _shorter(full, seconds)
-    for name in ("partitions", "crashes"):
-        yield from (
-            msgspec.structs.replace(full, **{name: rest})
-            for rest in _without_one(getattr(full, name))
-        )
+    for seconds in (failure.at + 0.001, *(full.seconds * share for share in _SHARES)):
+        if 0 < round(seconds, 3) < full.seconds:
+            yield _shorter(full, round(seconds, 3))
+    yield from _fewer_faults(full)
     yield from _smaller_fleets(full)
     for name, usual in (("link", Link()), ("clocks", Clocks())):
         if getattr(full, name) != usual:
@@ -155,11 +169,44 @@ def _simpler(failure: Failure) -> Iterator[Scenario]:
     if full.motion.loop_closures:
         motion = msgspec.structs.replace(full.motion, loop_closures=False)
         yield msgspec.structs.replace(full, motion=motion)
+    yield from _briefer_faults(full)
+    needed = round(max(failure.at - full.seconds, 0.0) + 0.001, 3)
+    if failure.name != NO_AGREEMENT and needed < full.patience:  # that fails with less, bug or not
+        yield msgspec.structs.replace(full, patience=needed)
 
 
 def _shorter(full: Scenario, seconds: float) -> Scenario:
     late = tuple(min(at, seconds) for at in full.late)
     return msgspec.structs.replace(full, seconds=seconds, late=late)
+
+
+def _fewer_faults(full: Scenario) -> Iterator[Scenario]:
+    """Without one partition, crash or late start."""
+    for name in ("partitions", "crashes", "late"):
+        for rest in _without_one(getattr(full, name)):
+            yield msgspec.structs.replace(full, **{name: rest})
+
+
+def _briefer_faults(full: Scenario) -> Iterator[Scenario]:
+    """With half of one partition, one robot down for half as long, or less late."""
+    for i, cut in enumerate(full.partitions):
+        middle = round((cut.start + cut.end) / 2, 3)
+        for ends in ({"end": middle}, {"start": middle}):
+            if cut.end - cut.start > _BRIEF:
+                yield _with_one(full, "partitions", i, msgspec.structs.replace(cut, **ends))
+    for i, crash in enumerate(full.crashes):
+        if crash.down > _BRIEF:
+            less = msgspec.structs.replace(crash, down=round(crash.down / 2, 3))
+            yield _with_one(full, "crashes", i, less)
+    for i, at in enumerate(full.late):
+        if at > _BRIEF:
+            yield _with_one(full, "late", i, round(at / 2, 3))
+
+
+def _with_one(full: Scenario, name: str, i: int, item: object) -> Scenario:
+    """With another i-th fault of a kind."""
+    items = getattr(full, name)
+    return msgspec.structs.replace(full, **{name: (*items[:i], item, *items[i + 1 :])})
 
 
 def _without_one(items: tuple[T, ...]) -> Iterator[tuple[T, ...]]:
