@@ -160,6 +160,8 @@ def run(total: int = TOTAL, moved: int = MOVED) -> list[dict[str, Any]]:
     """
     for config in (CONFIG, HALL):  # compiled and warm
         closure(config, "", 4 * CYCLE, 2 * CYCLE)
+    withdrawn(CONFIG, "", 4 * CYCLE, 2 * CYCLE)
+    unissued("", 4 * CYCLE, lambda seen: bent(seen, 2 * CYCLE))
     gc.collect()
     gc.freeze()  # as `dagmap agent` does
     return [

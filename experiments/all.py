@@ -10,7 +10,7 @@ import os
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
 from rich.console import Console
@@ -49,10 +49,13 @@ def main() -> int:
     warm_up(Console(stderr=True))  # once, for all of them
     failed = []
     with ThreadPoolExecutor(options.jobs) as pool:
-        for name, code, said, seconds in pool.map(lambda name: one(name, options.out), ALL):
+        for done in as_completed([pool.submit(one, name, options.out) for name in ALL]):
+            name, code, said, seconds = done.result()
             print(said.rstrip(), f"({name}: {seconds:.0f} s)", sep="\n", flush=True)
             failed += [name] if code else []
-    print(f"{options.out}: {len(ALL)} experiments in {time.perf_counter() - started:.0f} s")
+    took, processor = time.perf_counter() - started, os.times()
+    spent = processor.user + processor.system + processor.children_user + processor.children_system
+    print(f"{options.out}: {len(ALL)} experiments in {took:.0f} s, {spent:.0f} s of processor")
     if failed:
         print(f"FAILED: {', '.join(failed)}", file=sys.stderr)
     return 1 if failed else 0

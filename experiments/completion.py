@@ -52,8 +52,11 @@ def room(n_c: int, v_th: int, cycles: int) -> Row:
     mission, covered = Mission(scenario, 1), []
 
     def look(_: float) -> None:
-        positions = mission.honest[0].agent.map.positions
-        covered.append(len(np.unique(np.floor(positions / CELL), axis=0)))
+        mission.honest[0].agent.settle()
+        folded = mission.honest[0].agent.consensus.folded.components.values()
+        seeds = [np.zeros((0, 3)), *(component.fold.columns().seed for component in folded)]
+        cells = np.floor(np.concatenate(seeds) / (1000 * CELL))
+        covered.append(len(np.unique(cells, axis=0)))  # nodes alone: judging them takes longer
 
     mission.play(look)
     reached = [i + 1 for i, cells in enumerate(covered) if cells >= 0.95 * covered[-1]]

@@ -91,9 +91,11 @@ def draw(path: Path, cases: list[Row]) -> None:
                     point["delta"], point[SHOWN], marker, color=color, markersize=9, label=name
                 )
             axis.set_xscale("log")
-            axis.set_ylim(0, 1)
+            axis.set_xticks(DELTAS, [f"{100 * delta:g}" for delta in DELTAS])
+            axis.minorticks_off()
+            axis.set_ylim(0, 1.02)
             axis.set_title(row["sensor"], fontweight="bold")
-            axis.set_xlabel("delta, m")
+            axis.set_xlabel("delta, cm")
         axes[0].set_ylabel("F-score at 10 cm")
         axes[0].legend()
         save(path, figure)

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import errno
+from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
+import pytest
 
 from chains import CONFIG, Author, identity
 from dagmap import Agent
-from dagmap.io.data_folder import restore
-from dagmap.io.settings import AgentConfig, Settings, StoreConfig
+from dagmap.io.data_folder import open_folder, restore
+from dagmap.io.revocations import Revocations
+from dagmap.io.settings import AgentConfig, Settings, StoreConfig, load_settings
 from dagmap.io.store import Store
 from dagmap.messages import Transactions, encode
-from dagmap.model import Accepted, Forked
+from dagmap.model import Accepted, Forked, StoreError
 from dagmap.transaction import Transaction, parse, seal
 
 
@@ -41,3 +45,26 @@ def test_who_forks_twice_keeps_nobody_from_starting_again(tmp_path: Path) -> Non
         again = restore(Settings(config, tmp_path), robot, store, lambda data, total: data)
         assert again.ledger.chain(liar.identity.author).cut == 2
         assert again.digest() == agent.digest()
+
+
+def test_a_folder_in_place_of_the_ledger_gets_no_key(tmp_path: Path) -> None:
+    (tmp_path / "robot.toml").write_text('[store]\npath = "."\n')
+    with pytest.raises(StoreError, match=r"is a folder; let \[store\] path name a file in it"):
+        open_folder(load_settings(tmp_path / "robot.toml"))
+    assert [path.name for path in tmp_path.iterdir()] == ["robot.toml"]
+
+
+def test_too_many_open_files_do_not_stop_an_agent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Revocations in a folder are looked for every second; what cannot be read now comes later."""
+    (tmp_path / "0000.tx").write_bytes(b"revoked")
+    revocations = Revocations(tmp_path)
+
+    def full(folder: Path, pattern: str) -> Iterator[Path]:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "glob", full)
+        assert revocations.new() == []
+    assert revocations.new() == [b"revoked"]

@@ -378,6 +378,32 @@ def test_somebody_who_walked_by_is_gone_and_what_was_seen_often_stays() -> None:
         assert set(fold.evaluate(rays).states.tolist()) == {state}
 
 
+def test_feet_go_with_the_body_and_what_lasts_beside_them_stays() -> None:
+    """No ray comes through the feet, nor through the desk; but the feet were seen with the body."""
+    config = FoldConfig(delta=0.03, cell=0.1, max_ray=5.0)
+    body = [(1250, 50 + 31 * y, 50 + 31 * z) for y in range(4) for z in range(4)]
+    feet = [(1250, 50 + 31 * y, -150) for y in range(4)]
+    desk = [(1250, 230 + 31 * y, -150) for y in range(4)]
+    rays, fold, blocks = RayEvidence(config.cell_mm, config.max_ray_mm), make_fold(config), []
+    naive_rays = NaiveRays(config.cell_mm, config.max_ray_mm)
+    alive, base = np.ones(20, np.bool_), 0
+    for cycle, seen in enumerate([body + feet, desk, desk, desk]):
+        blocks.append(block(0, base, seen, cycle=cycle, origin=[(0, 50, 50)] * len(seen)))
+        fold.apply(blocks[-1])
+        ray = (0, [(0, 50, 50)], [0, len(seen)], seen)
+        walk(rays, *ray)
+        naive_rays.walk(0, [(0, 50, 50)], [0, len(seen)], seen, alive[: len(seen)].tolist(), 1)
+        base += len(seen)
+    for _ in range(4):
+        through = [(2 * x, 2 * y - 50, 2 * z - 50) for x, y, z in body]
+        walk(rays, 1, [(0, 50, 50)], [0, 16], through)
+        naive_rays.walk(1, [(0, 50, 50)], [0, 16], through, [True] * 16, 1)
+    states = fold.evaluate(rays).states.tolist()
+    assert states == [State.REJECTED] * 20 + [State.TENTATIVE] * 4
+    twin = naive_verdict(config, naive_default(config, blocks), naive_rays)
+    assert [state for *_, state in twin] == states
+
+
 def test_support_that_ends_in_the_cell_counts_against_the_own_misses() -> None:
     rays = no_rays()
     fold = applied(EAGER, [block(0, 0, [(10, 10, 10)])])

@@ -184,9 +184,8 @@ def euroc(list_of_right: bytes) -> bytes:
     return pack((files | {b"mav0/cam1/data.csv": list_of_right}).items())
 
 
-def kitti(row: bytes) -> bytes:
+def kitti(row: bytes, mounted: bytes = b"Tr: " + b"1e200 " * 12) -> bytes:
     files = dict(files_of(next(iter(targets.load("scans").seeds()))))
-    mounted = b"Tr: " + b"1e200 " * 12 + b"\n"
     return pack((files | {b"poses.txt": 2 * row, b"calib.txt": mounted}).items())
 
 
@@ -256,6 +255,7 @@ FOUND |= {
     "a scan too sparse for odometry": ("scans", lambda: pack([(b"0.bin", bytes(range(1, 33)))])),
     "a picture's name with a zero": ("euroc", lambda: euroc(b"1000000000,\0.png\n")),
     "a pose whose product overflows": ("scans", lambda: kitti(b"1e200 " * 11 + b"1\n")),
+    "a line of one comma": ("scans", lambda: kitti(b"1 " * 12 + b"\n", mounted=b",\n")),
     "a picture's name of two lines": ("colmap", lambda: colmap(b"a\nb")),
     "a place that is no number": ("rtabmap", lambda: b"UPDATE Feature SET depth_x = x'ff'"),
 }

@@ -178,6 +178,7 @@ def test_an_empty_folder_may_be_named(fleet: Fleet, tmp_path: Path) -> None:
         (("enroll", "a" * 64, "--out", "o"), "1 to 63 letters"),
         (("enroll", "a", "--out", "o", "--days", "0"), "--days 0: 1 to 3650 is wanted"),
         (("enroll", "a", "--out", "o", "--address", "ä.org"), "--address ä.org"),
+        (("enroll", "a", "--out", "o", "--address", ""), "'' is no IP address or host name"),
         (("renew", "robot9", "--out", "o"), "known are: robot1"),
     ],
 )

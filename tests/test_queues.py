@@ -10,7 +10,7 @@ import pytest
 import dagmap.agent
 from dagmap import Accepted, Config, Cycle
 from dagmap.agent import Parsers
-from dagmap.io.queues import Inbox, Question, Rates, SendQueue, Throttle
+from dagmap.io.queues import Inbox, Question, Rates, SendQueue
 from dagmap.messages import Heads, Kind, Transactions, Want, encode, kind_of
 from dagmap.model import Outgoing
 from scene import agent as scene_agent
@@ -33,26 +33,30 @@ def cycle(stamp: float) -> Cycle:
 
 class TestInbox:
     def test_messages_come_out_in_order_and_a_few_at_a_time(self) -> None:
-        inbox = Inbox(1 << 20, 1 << 20)
-        sent = [message(100 + i) for i in range(2 * Inbox.MESSAGES)]
+        inbox, few = Inbox(1 << 20, 1 << 20, at_once=5), 5
+        sent = [message(100 + i) for i in range(2 * few)]
         assert all(inbox.put_message(data) for data in sent)
-        assert inbox.take(0).messages == sent[: Inbox.MESSAGES]
-        assert inbox.take(0).messages == sent[Inbox.MESSAGES :]
+        assert inbox.take(0).messages == sent[:few]
+        assert inbox.take(0).messages == sent[few:]
         assert inbox.take(0).messages == []
 
     def test_one_sender_cannot_crowd_out_another(self) -> None:
-        inbox = Inbox(10_000, 4_000)
+        inbox = Inbox(10 * (1_000 + Inbox.HELD), 4 * (1_000 + Inbox.HELD))
         taken = [inbox.put_message(message(1_000, YOU)) for _ in range(6)]
         assert taken == [True] * 4 + [False] * 2
         assert inbox.put_message(message(1_000, ME))
         assert inbox.dropped == 2
 
     def test_all_senders_together_are_bounded(self) -> None:
-        inbox = Inbox(10_000, 4_000)
+        inbox = Inbox(10 * (1_000 + Inbox.HELD), 4 * (1_000 + Inbox.HELD))
         taken = [inbox.put_message(message(1_000, bytes([i]) * 8)) for i in range(12)]
         assert sum(taken) == 10 and inbox.dropped == 2
         assert len(inbox.take(0).messages) == 10
         assert inbox.put_message(message(1_000))  # what was taken has made room
+
+    def test_the_smallest_messages_are_bounded_too(self) -> None:
+        inbox = Inbox(100 * Inbox.HELD, 100 * Inbox.HELD)
+        assert sum(inbox.put_message(b"") for _ in range(1000)) == 100
 
     def test_a_message_too_short_to_name_its_sender(self) -> None:
         inbox = Inbox(1_000, 1_000)
@@ -173,7 +177,7 @@ class TestRates:
         inbox, now = self.make(messages=20, messages_of_one=10)
         names = [i.to_bytes(8, "big") for i in range(1000)]
         assert sum(self.put(inbox, 1, sender=name) for name in names) == 20
-        assert len(inbox._throttle._of_one) == Throttle.SENDERS
+        assert len(inbox._throttle._of_one) == Rates().senders
         now[0] += 1.0
         assert self.put(inbox, 50) == 10  # the honest robot's share is there again
 

@@ -213,6 +213,16 @@ def test_bad_clouds_are_named_or_left_out(
     assert len(source.skips.told) == 1  # type: ignore[attr-defined]
 
 
+def test_a_nan_that_signals_is_a_point_left_out(tmp_path: Path) -> None:
+    (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
+    rows = np.ones((3, 4), "<f4") * [[1], [2], [3]]
+    data = bytearray(rows.astype("<f4").tobytes())
+    data[16:20] = bytes.fromhex("7f7fbf7f")  # x of the second point
+    (tmp_path / "000000.bin").write_bytes(data)
+    (cycle,) = open_source(tmp_path)
+    assert cycle.points[:, 0].tolist() == [1.0, 3.0]
+
+
 def test_damaged_clouds_never_crash(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")

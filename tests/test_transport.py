@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import datetime as dt
+import socket
+import struct
+import subprocess
 import sys
 import urllib.error
 import urllib.request
@@ -30,6 +33,15 @@ from robots import free_port, until
 from scene import agent as scene_agent
 
 FLEET = Config(fleet="transport test")
+HUGE = """import sys, zenoh
+config = zenoh.Config()
+config.insert_json5("connect/endpoints", '["' + sys.argv[1] + '"]')
+config.insert_json5("scouting/multicast/enabled", "false")
+session = zenoh.open(config)
+session.put(sys.argv[2], bytes(1 << 27), congestion_control=zenoh.CongestionControl.BLOCK)
+session.put(sys.argv[2], bytes.fromhex(sys.argv[3]))
+sys.stdin.read()
+"""
 NAMES = (b"robot..a", b"robot..b", b"robot..c")
 
 
@@ -90,6 +102,21 @@ class TestReach:
             a.send([Outgoing(b"first", None), Outgoing(b"second", None)])
             until(lambda: taken == [b"second"], "the second message")
         assert a.dropped == 1
+
+    def test_of_a_huge_message_nothing_is_kept(self, opened: ExitStack) -> None:
+        """From another process, since both ends would count here."""
+        port = free_port()
+        _, inbox = station(opened, NAMES[0], port)
+        key = f"dagmap/{FLEET.fleet_id.hex()}/all"
+        Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
+        before = _peak()
+        sender = [sys.executable, "-c", HUGE, f"tcp/127.0.0.1:{port}", key, hello(NAMES[1]).hex()]
+        with subprocess.Popen(sender, stdin=subprocess.PIPE) as process:
+            try:
+                assert _taken(inbox, 1) == [hello(NAMES[1])]  # what comes after it still comes
+            finally:
+                process.kill()
+        assert _peak() - before < 64 << 20
 
     def test_who_leaves_is_no_longer_here(self, opened: ExitStack) -> None:
         port = free_port()
@@ -165,6 +192,36 @@ class TestMetrics:
             _get(f"{base}/elsewhere")
         error.value.close()
 
+    def test_who_hangs_up_leaves_no_trace(
+        self, opened: ExitStack, capfd: pytest.CaptureFixture[str]
+    ) -> None:
+        """Nor does one who says nothing keep others out, and there are only so many of those."""
+        server = opened.enter_context(MetricsServer(("127.0.0.1", 0), *self.robot(opened)))
+        for _ in range(3):
+            with socket.create_connection(server.address, 10) as asker:
+                asker.sendall(b"GET /metr")
+                asker.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        silent = [socket.create_connection(server.address, 10) for _ in range(30)]
+        until(lambda: sum(_hung_up(asker) for asker in silent) >= 14)
+        assert not all(_hung_up(asker) for asker in silent)
+        for asker in silent:
+            asker.close()
+        until(
+            lambda: "dagmap_cycles_total" in _try(f"http://127.0.0.1:{server.address[1]}/metrics")
+        )
+        assert "Traceback" not in capfd.readouterr().err
+
+    @pytest.mark.skipif(not socket.has_ipv6, reason="there is no IPv6 on this machine")
+    def test_addresses_of_ipv6(self, opened: ExitStack) -> None:
+        server = opened.enter_context(MetricsServer(("::1", 0), *self.robot(opened)))
+        assert "dagmap_cycles_total" in _get(f"http://[::1]:{server.address[1]}/metrics")
+
+    def robot(self, opened: ExitStack) -> tuple[Runtime, Transport]:
+        transport, inbox = station(opened, NAMES[0], free_port())
+        store = SimpleNamespace(append_many=lambda rows: None)
+        log = Log(sys.stderr, "error")
+        return Runtime(scene_agent("a"), store, transport, inbox, log, lambda _: {}), transport
+
     def test_an_address_in_use(self, opened: ExitStack) -> None:
         transport, inbox = station(opened, NAMES[0], free_port())
         store = SimpleNamespace(append_many=lambda rows: None)
@@ -235,3 +292,27 @@ def _taken(inbox: Inbox, count: int) -> list[bytes]:
 def _get(address: str) -> str:
     with urllib.request.urlopen(address, timeout=10) as answer:
         return str(answer.read(), "utf-8")
+
+
+def _try(address: str) -> str:
+    try:
+        return _get(address)
+    except OSError:
+        return ""
+
+
+def _hung_up(asker: socket.socket) -> bool:
+    """Whether the other end has closed the connection."""
+    asker.setblocking(False)
+    try:
+        return asker.recv(1) == b""
+    except BlockingIOError:
+        return False
+    except ConnectionError:
+        return True
+
+
+def _peak() -> int:
+    """Largest memory of this process, bytes."""
+    status = Path("/proc/self/status").read_text()
+    return 1024 * int(status.partition("VmHWM:")[2].split()[0])

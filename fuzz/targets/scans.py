@@ -80,6 +80,8 @@ def seeds() -> Iterable[bytes]:
     many = np.random.default_rng(2).uniform(-3, 3, (120, 4)).astype("<f4").tobytes()
     yield pack([(b"0.bin", many), (b"1.bin", many)])
     yield pack([(b"0.bin", bytes(32)), (b"poses.txt", row)])
+    signal = b"\x01\x00\x80\x7f" * 4  # NaNs that signal
+    yield pack([(b"0.bin", signal), (b"poses.txt", row)])
     yield pack([*bins])  # odometry, which wants more points
     tum = b"# stamp\n1 0 0 0 0 0 0 1\n1.5 0 0 1 0 0 0 1\n"
     yield pack([*bins, (b"poses.txt", tum)])

@@ -106,7 +106,7 @@ def gone(found: Evidence, place: Int64s, moment: Int64s) -> Bools:
 
     Of the nodes in the 27 cubes about it that were seen last in the same moment, half or more are
     `crossed`, and four at least. So what no ray came through, as feet, goes with the rest;
-    and what merely lies where somebody was seen at another time stays.
+    and what was seen beside it in other moments, three or more, stays.
     moment: (N,) a number for the author and cycle that saw each node last.
     """
     marked = crossed(found, place)

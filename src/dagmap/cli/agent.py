@@ -57,6 +57,10 @@ class AgentCommand:
         """0: stopped, or agreed. Raises DagmapError."""
         if not self.speed > 0:
             raise DagmapError(f"--speed {self.speed}: more than 0 is wanted; 1 is as recorded")
+        if self.wait_for < 0:
+            raise DagmapError(f"--wait-for {self.wait_for}: a number of robots is wanted")
+        if self.until_agreed is not None and not self.until_agreed >= 0:
+            raise DagmapError(f"--until-agreed {self.until_agreed}: seconds, 0 or more, are wanted")
         settings = self._settings()
         load_zenoh()
         source = self._open_source(settings)
@@ -150,7 +154,8 @@ class AgentCommand:
         stack.callback(checkpoint.write, agent)  # closes before the store does
         stack.enter_context(StatusServer(settings.control, inbox))
         if (address := config.metrics.address) is not None:
-            stack.enter_context(MetricsServer(address, runtime, transport))
+            askers = config.metrics.askers
+            stack.enter_context(MetricsServer(address, runtime, transport, askers))
         _log_start(log, agent, settings)
         return runtime, transport
 
@@ -174,8 +179,10 @@ def _inbox(config: AgentConfig) -> Inbox:
         network.receive_messages_per_second_per_robot,
         network.receive_bytes_per_second_per_robot,
         config.sync.chunk_bytes,
+        network.senders_remembered,
     )
-    return Inbox(network.receive_bytes, network.receive_bytes_per_robot, rates)
+    most, of_one = network.receive_bytes, network.receive_bytes_per_robot
+    return Inbox(most, of_one, rates, at_once=network.messages_per_step)
 
 
 def _report(transport: Transport, runtime: Runtime) -> dict[str, object]:

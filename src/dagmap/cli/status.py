@@ -50,7 +50,7 @@ def _robots(answer: dict[str, Any]) -> Table:
     """A row for every author that the ledger has or the network shows."""
     table = Table()
     for heading in ("robot", "author", "transactions", "in reach", "delay", "heard"):
-        table.add_column(heading)
+        table.add_column(heading, no_wrap=heading == "author", overflow="ignore")
     heads, peers = answer["heads"], answer["peers"]
     for author in sorted(heads.keys() | peers.keys()):
         head, peer = heads.get(author), peers.get(author, {})

@@ -93,4 +93,7 @@ def _address(entry: str) -> x509.GeneralName:
     try:
         return x509.IPAddress(ip_address(entry))
     except ValueError:
-        return x509.DNSName(entry)
+        pass
+    if not entry or not entry.isprintable() or " " in entry:
+        raise ValueError(f"{entry!r} is no IP address or host name")
+    return x509.DNSName(entry)

@@ -49,7 +49,8 @@ def _read_ply(path: Path) -> Cloud:
     vertices = read_vertices(path, ("x", "y", "z"), "give a PLY with x, y and z in metres", _FITS)
     names = vertices.dtype.names or ()
     states = vertices["state"].astype(np.uint8) if "state" in names else None
-    return Cloud(np.stack([vertices[n].astype(np.float64) for n in "xyz"], axis=1), states)
+    with np.errstate(invalid="ignore"):  # NaNs that signal stay what they are
+        return Cloud(np.stack([vertices[n].astype(np.float64) for n in "xyz"], axis=1), states)
 
 
 def _read_npz(path: Path) -> Cloud:

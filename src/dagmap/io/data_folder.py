@@ -52,6 +52,8 @@ def open_folder(settings: Settings) -> tuple[Identity, Store]:
     In a closed fleet the key is the enrolled one. Raises StoreError, and KeysError for that key.
     """
     path, fleet = settings.ledger, settings.config.fleet_id
+    if path.is_dir():
+        raise StoreError(f"{path}: is a folder; let [store] path name a file in it")
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:

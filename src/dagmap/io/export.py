@@ -117,8 +117,10 @@ def read_ply(path: Path) -> PlyMap:
     """
     names = [name for name, _, _ in _VERTEX]
     vertices = read_vertices(path, names, "give a map.ply that DAGmap wrote", _WHOLE)
+    with np.errstate(invalid="ignore"):  # NaNs that signal stay what they are
+        places = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=1)
     return PlyMap(
-        np.stack([vertices[name].astype(np.float64) for name in ("x", "y", "z")], axis=1),
+        places,
         np.stack([vertices[name].astype(np.uint8) for name in ("red", "green", "blue")], axis=1),
         vertices["state"].astype(np.uint8),
         *(vertices[name].astype(np.int64) for name in ("hits", "misses", "witnesses")),

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 from collections.abc import Iterable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
 
 from ..model import NetworkError
 from .closing import Closing
@@ -63,11 +65,42 @@ def _families(
     yield "refused_total", "counter", "Foreign bytes that were refused.", refused
 
 
+class _Server(ThreadingHTTPServer):
+    """Takes so many askers at a time, and says nothing of those who leave in the middle."""
+
+    daemon_threads = True
+
+    def __init__(
+        self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler], most: int
+    ) -> None:
+        self._free = threading.Semaphore(most)
+        self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+        super().__init__(address, handler)
+
+    def verify_request(self, request: object, client_address: object) -> bool:
+        return self._free.acquire(blocking=False)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """The log is for the fleet: a line of many for everyone who hangs up would fill it."""
+
+
 class MetricsServer(Closing):
     """Serves the metrics on a thread of its own."""
 
-    def __init__(self, address: tuple[str, int], runtime: Runtime, transport: Transport) -> None:
-        """Raises NetworkError where the address cannot be listened on."""
+    def __init__(
+        self,
+        address: tuple[str, int],
+        runtime: Runtime,
+        transport: Transport,
+        askers: int = 16,
+    ) -> None:
+        """askers: served at a time. Raises NetworkError where the address cannot be listened on."""
 
         class Handler(BaseHTTPRequestHandler):
             timeout = 10
@@ -87,14 +120,13 @@ class MetricsServer(Closing):
                 """The log is for the fleet, not for whoever reads its numbers."""
 
         try:
-            self._server = ThreadingHTTPServer(address, Handler)
+            self._server = _Server(address, Handler, askers)
         except OSError as error:
             raise NetworkError(
                 f"metrics.listen: {address[0]}:{address[1]} cannot be listened on "
                 f"({error.strerror}); name another address"
             ) from None
         self.address: tuple[str, int] = (address[0], self._server.server_address[1])
-        self._server.daemon_threads = True
         self._thread = threading.Thread(
             target=self._server.serve_forever, args=(0.1,), name="dagmap metrics", daemon=True
         )

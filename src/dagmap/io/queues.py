@@ -43,6 +43,7 @@ class Rates:
     messages_of_one: float = math.inf
     bytes_of_one: float = math.inf
     question: int = 0  # bytes that a question counts for: those of the answer that it may cause
+    senders: int = 256  # that are remembered; whoever is forgotten begins anew
 
 
 @dataclass(slots=True)
@@ -67,8 +68,6 @@ class Throttle:
     those of one keep an honest robot that has gone wrong from crowding out the others.
     """
 
-    SENDERS = 256  # that are remembered; whoever is forgotten begins anew
-
     def __init__(self, rates: Rates, clock: Callable[[], float]) -> None:
         self._rates, self._clock = rates, clock
         self._all = _Bucket(rates.messages, math.inf, clock())
@@ -82,7 +81,7 @@ class Throttle:
             sender, _Bucket(rates.messages_of_one, rates.bytes_of_one, now)
         )
         self._of_one.move_to_end(sender)
-        if len(self._of_one) > self.SENDERS:
+        if len(self._of_one) > rates.senders:
             self._of_one.popitem(last=False)
         self._all.fill(rates.messages, math.inf, now)
         one.fill(rates.messages_of_one, rates.bytes_of_one, now)
@@ -98,11 +97,13 @@ class Inbox:
     """What comes in for the agent: messages, cycles, questions. Any thread puts, one takes.
 
     most, most_of_one: bytes of messages that wait, in all and of one sender (as the message names
-        it: a hint, so the first bound is what holds against liars). What exceeds them is dropped.
+        it: a hint, so the first bound is what holds against liars), and HELD more for each. What
+        exceeds them is dropped.
     rates: how fast messages may come; what comes faster is dropped, too.
+    at_once: messages that are taken at a time, so that a cycle never waits behind many.
     """
 
-    MESSAGES = 16  # taken at once, so that a cycle never waits behind many
+    HELD = 64  # bytes of memory that a message takes beside its own
 
     def __init__(
         self,
@@ -110,7 +111,9 @@ class Inbox:
         most_of_one: int,
         rates: Rates | None = None,
         clock: Callable[[], float] = time.monotonic,
+        at_once: int = 16,
     ) -> None:
+        self._at_once = at_once
         self._most, self._most_of_one = most, most_of_one
         self._throttle = Throttle(rates or Rates(), clock)
         self._change = threading.Condition()
@@ -123,18 +126,23 @@ class Inbox:
 
     def put_message(self, data: bytes) -> bool:
         """Keep a message, or drop it where it would exceed a bound."""
-        sender = sender_of(data)
+        sender, size = sender_of(data), len(data) + self.HELD
         with self._change:
-            full = self._size + len(data) > self._most
-            full = full or self._size_of[sender] + len(data) > self._most_of_one
+            full = self._size + size > self._most
+            full = full or self._size_of[sender] + size > self._most_of_one
             if full or not self._throttle.lets(sender, data):
                 self.dropped += 1
                 return False
-            self._size += len(data)
-            self._size_of[sender] += len(data)
+            self._size += size
+            self._size_of[sender] += size
             self._messages.append(data)
             self._change.notify_all()
             return True
+
+    def drop(self) -> None:
+        """Count a message that never came this far."""
+        with self._change:
+            self.dropped += 1
 
     @property
     def unread(self) -> bool:
@@ -163,11 +171,11 @@ class Inbox:
         with self._change:
             self._change.wait_for(self._something, max(0.0, patience))
             work, self._work = self._work, Work()
-            while self._messages and len(work.messages) < self.MESSAGES:
+            while self._messages and len(work.messages) < self._at_once:
                 data = self._messages.popleft()
-                sender = sender_of(data)
-                self._size -= len(data)
-                self._size_of[sender] -= len(data)
+                sender, size = sender_of(data), len(data) + self.HELD
+                self._size -= size
+                self._size_of[sender] -= size
                 if not self._size_of[sender]:
                     del self._size_of[sender]
                 work.messages.append(data)

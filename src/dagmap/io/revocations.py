@@ -17,7 +17,7 @@ class Revocations:
     def new(self) -> list[bytes]:
         """What has come since the last call. What cannot be read now is tried again."""
         found = []
-        for path in sorted(self._folder.glob("*.tx")):
+        for path in self._files():
             try:
                 about = path.stat()
                 version = path.name, about.st_size, about.st_mtime_ns
@@ -28,3 +28,9 @@ class Revocations:
                 continue
             self._read.add(version)
         return found
+
+    def _files(self) -> list[Path]:
+        try:
+            return sorted(self._folder.glob("*.tx"))
+        except OSError:  # such as too many open files: the agent has to go on
+            return []

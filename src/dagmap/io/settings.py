@@ -79,6 +79,11 @@ class NetworkConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
     # From one robot, more than can be verified and folded (6 MB). A question counts for
     # `sync.chunk_bytes`: nobody makes a robot answer faster than that by asking and asking.
     receive_bytes_per_second_per_robot: int = 16 << 20
+    # Whoever reaches the network can claim to be many: senders whose rate is remembered (the
+    # oldest are forgotten), and robots in reach (nobody more is counted until somebody leaves).
+    senders_remembered: int = 256
+    robots_remembered: int = 4096
+    messages_per_step: int = 16  # a cycle of the SLAM never waits behind more
 
     def __post_init__(self) -> None:
         for name in ("send_bytes", "receive_bytes", "receive_bytes_per_robot"):
@@ -87,6 +92,8 @@ class NetworkConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
         self._require_range("receive_messages_per_second", 10, 1 << 32)
         self._require_range("receive_messages_per_second_per_robot", 10, 1 << 32)
         self._require_range("receive_bytes_per_second_per_robot", 1 << 16, 1 << 40)
+        for name in ("senders_remembered", "robots_remembered", "messages_per_step"):
+            self._require_range(name, 1, 1 << 20)
         self._require(
             self.mode != "client" or bool(self.connect) or self.scouting,
             "mode",
@@ -115,8 +122,10 @@ class MetricsConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Numbers for Prometheus under http://LISTEN/metrics; off unless an address is given."""
 
     listen: str | None = None  # "127.0.0.1:9464"; anybody who reaches the address can read it
+    askers: int = 16  # at a time: each has a thread for as long as it may be silent, 10 s
 
     def __post_init__(self) -> None:
+        self._require_range("askers", 1, 1 << 10)
         if self.listen is not None:
             host, _, port = self.listen.rpartition(":")
             right = bool(host) and port.isdecimal() and int(port) < 1 << 16
@@ -200,7 +209,13 @@ def load_settings(path: Path) -> Settings:
 
     Raises ConfigError that names the file, the key and what is wanted.
     """
-    config = load_config(path, AgentConfig)
+    try:
+        config = load_config(path, AgentConfig)
+    except ConfigError as error:
+        if "required field `store`" in str(error):
+            remedy = 'add one with path = "data/ledger.db"'
+            raise ConfigError(f"{path}: there is no table [store]; {remedy}") from None
+        raise
     if not config.name and not config.closed:
         try:
             config = msgspec.structs.replace(config, name=path.stem)

@@ -20,6 +20,7 @@ from .transport import Transport
 
 _PATIENCE = 30.0  # s for an answer: an agent that copies a map works on it meanwhile
 _MOST = 64 << 20  # bytes of an answer
+_PAUSE = 0.5  # s before the next try, where nobody can be let in
 _PATH = 100  # bytes that the address of a socket has room for, and some
 
 
@@ -133,8 +134,9 @@ class StatusServer(Closing):
         while not self._closed.is_set():
             try:
                 asker, _ = self._socket.accept()
-            except OSError:
-                return
+            except OSError:  # closed; or too many files are open, which may pass
+                self._closed.wait(_PAUSE)
+                continue
             with asker:
                 self._answer(asker)
 

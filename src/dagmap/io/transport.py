@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 _SEND_BUFFER = 65_536  # bytes in the kernel: what waits there can no longer be dropped or overtaken
 _RETRY = {"period_init_ms": 250, "period_max_ms": 2000, "period_increase_factor": 2.0}
-_ROBOTS = 4096  # whose presence is remembered: anybody in reach can claim to be many
+_LARGEST = 65_536  # bytes that Zenoh puts together of what comes in: a message, its key and more
 
 
 class Traffic:
@@ -72,12 +72,13 @@ class Transport(Closing):
         """Open the session. Raises NetworkError that names the endpoint or the missing extra."""
         self._zenoh = load_zenoh()
         self._me, self._inbox = me, inbox
+        self._most_robots = network.robots_remembered
         self._prefix = f"dagmap/{fleet_id.hex()}"
         self._here: set[AuthorId] = set()
         self._queue = SendQueue(network.send_bytes)
         self._refused = 0  # messages that Zenoh did not take
         self.traffic = Traffic()
-        self._session = open_session(self._zenoh, network, folder)
+        self._session = open_session(self._zenoh, network, folder, largest=_LARGEST)
         self._declared = self._declare()
         self._sender = threading.Thread(target=self._publish, name="dagmap send", daemon=True)
         self._sender.start()
@@ -130,7 +131,10 @@ class Transport(Closing):
 
     def _receive(self, sample: zenoh.Sample) -> None:
         """In a thread of Zenoh's: look at the size and the sender only, and pass on."""
-        if sample.kind != self._zenoh.SampleKind.PUT or len(sample.payload) > MAX_MESSAGE:
+        if sample.kind != self._zenoh.SampleKind.PUT:
+            return
+        if len(sample.payload) > MAX_MESSAGE:
+            self._inbox.drop()
             return
         data = sample.payload.to_bytes()
         self.traffic.count("received", data)
@@ -144,7 +148,11 @@ class Transport(Closing):
             return
         if sample.kind == self._zenoh.SampleKind.DELETE:
             self._here = self._here - {author}
-        elif len(author) == len(self._me) and author != self._me and len(self._here) < _ROBOTS:
+        elif (
+            len(author) == len(self._me)
+            and author != self._me
+            and len(self._here) < self._most_robots
+        ):
             self._here = self._here | {author}
 
     def _publish(self) -> None:
@@ -175,8 +183,10 @@ def load_zenoh() -> Any:
         ) from None
 
 
-def session_config(network: NetworkConfig, folder: Path) -> dict[str, object]:
-    """What Zenoh is told: its configuration keys and values."""
+def session_config(
+    network: NetworkConfig, folder: Path, largest: int | None = None
+) -> dict[str, object]:
+    """What Zenoh is told: its configuration keys and values. largest: see `open_session`."""
     protocol = "tcp" if network.tls is None else "tls"
     listen = network.listen
     if not listen and network.mode == "peer":
@@ -196,6 +206,8 @@ def session_config(network: NetworkConfig, folder: Path) -> dict[str, object]:
         "transport/link/tcp/so_sndbuf": _SEND_BUFFER,
         "transport/link/tls/so_sndbuf": _SEND_BUFFER,
     }
+    if largest is not None:  # by default Zenoh takes a gigabyte, of anybody
+        out["transport/link/rx/max_message_size"] = largest
     if network.tls is not None:
         path = {
             name: str(folder / getattr(network.tls, name)) for name in ("ca", "certificate", "key")
@@ -214,10 +226,15 @@ def session_config(network: NetworkConfig, folder: Path) -> dict[str, object]:
 
 
 def open_session(
-    module: Any, network: NetworkConfig, folder: Path, table: str = "network"
+    module: Any,
+    network: NetworkConfig,
+    folder: Path,
+    table: str = "network",
+    largest: int | None = None,
 ) -> zenoh.Session:
     """A session as the configuration wants it; table: what it is called in the robot's file.
 
+    largest: bytes of a message; of what is larger nothing is kept. None: what Zenoh takes.
     Raises NetworkError that names the endpoint or the file.
     """
     if network.tls is not None:
@@ -225,7 +242,7 @@ def open_session(
             if not path.is_file():
                 raise NetworkError(f"network.tls.{name}: {path} is missing; correct the path")
     config = module.Config()
-    for key, value in session_config(network, folder).items():
+    for key, value in session_config(network, folder, largest).items():
         try:
             config.insert_json5(key, json.dumps(value))
         except module.ZError as error:

@@ -11,6 +11,12 @@ from ._source import Options
 _SHIFT = 21  # bits of a voxel's number along one axis
 
 
+def doubles(values: npt.NDArray[np.generic]) -> Floats:
+    """The same numbers as doubles. A NaN that signals is a NaN, nothing to be warned of."""
+    with np.errstate(invalid="ignore"):
+        return values.astype(np.float64)
+
+
 def thinned(
     points: Floats, colors: Uint8s | None, options: Options
 ) -> tuple[Floats, Uint8s | None]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...model import Floats, RecordingError, Uint8s
+from ._cloud import doubles
 from ._source import read_bytes
 
 _MOST_HEADER = 100  # lines
@@ -47,7 +48,7 @@ def _parse(data: bytes) -> tuple[Floats, Uint8s | None]:
         rows = _compressed(data, at, kind, count)
     else:
         raise ValueError(f"its data is {form[:20]!r}")
-    points = np.stack([rows[axis].astype(np.float64).reshape(count) for axis in "xyz"], axis=1)
+    points = np.stack([doubles(rows[axis]).reshape(count) for axis in "xyz"], axis=1)
     color = next((name for name in ("rgb", "rgba") if name in names), None)
     if color is None or kind[color].itemsize != 4:
         return points, None

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...model import Floats, Uint8s
+from ._cloud import doubles
 from ._poses import matrix
 from ._rgbd import complete
 
@@ -91,7 +92,7 @@ def cloud_arrays(message: Any) -> tuple[Floats, Uint8s | None]:
     data = data[: row * height].reshape(height, row)[:, : step * width]
     rows = np.frombuffer(data.tobytes(), kind)
     with np.errstate(invalid="ignore"):  # signalling NaNs stay what they are
-        points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
+        points = np.stack([doubles(rows[axis]) for axis in "xyz"], axis=1)
     color = next((name for name in ("rgb", "rgba") if name in wanted), None)
     if color is None or rows.dtype[color].itemsize != 4:
         return points, None

@@ -119,9 +119,6 @@ def read_rows(path: Path) -> list[tuple[int, list[str]]]:
         text = read_bytes(path).decode()
     except UnicodeDecodeError:
         raise RecordingError(f"{path}: not a text file in UTF-8; write it anew") from None
-    rows = ((number, line.strip()) for number, line in enumerate(text.splitlines(), 1))
-    return [
-        (number, line.replace(",", " ").split())
-        for number, line in rows
-        if line and not line.startswith("#")
-    ]
+    lines = ((number, line.strip()) for number, line in enumerate(text.splitlines(), 1))
+    rows = [(number, line.replace(",", " ").split()) for number, line in lines if line[:1] != "#"]
+    return [(number, words) for number, words in rows if words]

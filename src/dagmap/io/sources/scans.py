@@ -17,7 +17,7 @@ import numpy as np
 
 from ...model import Cycle, Floats, RecordingError, Uint8s
 from ..ply import read_vertices
-from ._cloud import thinned
+from ._cloud import doubles, thinned
 from ._kiss import KissIcp
 from ._pcd import read_pcd
 from ._poses import inverse
@@ -223,12 +223,12 @@ def _read_bin(path: Path) -> tuple[Floats, Uint8s | None]:
             "reflectance, float32); it is cut short or of another format"
         )
     rows = np.frombuffer(data, "<f4").reshape(-1, _WHOLE_KITTI)
-    return rows[:, :3].astype(np.float64), None
+    return doubles(rows[:, :3]), None
 
 
 def _read_ply(path: Path) -> tuple[Floats, Uint8s | None]:
     rows = read_vertices(path, tuple("xyz"), "copy or write it anew", _FITS)
-    points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    points = np.stack([doubles(rows[axis]) for axis in "xyz"], axis=1)
     if not set(_COLORS) <= set(rows.dtype.names or ()):
         return points, None
     return points, np.stack([rows[name].astype(np.uint8) for name in _COLORS], axis=1)
