@@ -100,6 +100,25 @@ def test_without_optimisation_and_with_several_sessions(tmp_path: Path) -> None:
         assert np.allclose(cycle.pose, pose_at(cycle.stamp), atol=1e-6)
 
 
+@pytest.mark.parametrize(("bad", "stamps", "moved"), [(2, [1, 3], [1]), (3, [1, 2, 2.001], [1, 2])])
+def test_a_node_that_is_left_out_is_not_moved(
+    tmp_path: Path, bad: int, stamps: list[float], moved: list[float]
+) -> None:
+    """The others are, even where the last one is to be left out, which brings the moves."""
+    path = write(tmp_path / "walk.db")
+    with closing(sqlite3.connect(path)) as db, db:
+        db.execute("UPDATE Feature SET depth_x = 1e9 WHERE node_id = ? AND word_id = 0", (bad,))
+    found = list(open_source(path, Options(keep_going=True)))
+    assert [cycle.stamp for cycle in found] == pytest.approx(stamps)
+    assert [cycle.moved for cycle in found[:-1]] == [None] * (len(found) - 1)
+    assert found[-1].moved is not None
+    there, poses = found[-1].moved
+    assert there.tolist() == moved
+    assert np.allclose(poses, [pose_at(stamp) for stamp in moved], atol=1e-6)
+    with pytest.raises(RecordingError, match="--keep-going leaves it out"):
+        list(open_source(path))
+
+
 def test_a_database_becomes_a_map(tmp_path: Path) -> None:
     path = write(tmp_path / "walk.db")
     run = dagmap("inspect", path)

@@ -290,6 +290,46 @@ class TestBad:
             list(open_source(path))
         assert len(open_source(path, Options(keep_going=True))) >= 4
 
+    def test_a_node_that_is_left_out_is_not_moved(self, tmp_path: Path) -> None:
+        messages = mapping()
+        messages[2][3].nodes[0].word_pts[0].x = 1e9
+        path = write(tmp_path / "walk.mcap", messages)
+        with pytest.raises(RecordingError, match="node 3: cycle at 3.0.*not finite.*--keep-going"):
+            list(open_source(path))
+        found = list(open_source(path, Options(keep_going=True)))
+        assert [cycle.stamp for cycle in found] == pytest.approx([1, 2, 4, 4.001])
+        assert found[3].moved is not None
+        assert np.asarray(found[3].moved[0]).tolist() == [2.0, 4.0]
+        agent = Agent(Identity.from_seed(bytes(32)), Config())
+        for cycle in found:
+            agent.observe(cycle, float(cycle.stamp))
+
+    def test_what_a_refused_message_would_have_moved_the_next_one_moves(self) -> None:
+        told: list[str] = []
+        follower = GraphFollower(Options(), told.append)
+        for message in mapping(closes=False)[:2]:
+            follower.data(message[3])
+        closed = {n: drift(1) @ pose_at(float(n)) for n in (1, 2, 3)}
+        bad = data(3.0, [node(3, 3.0, closed[3], np.ones((1, 3)))], closed)[3]
+        bad.nodes[0].word_pts[0] = SimpleNamespace(x=1.0)
+        with pytest.raises(AttributeError):
+            follower.data(bad)
+        (cycle,) = follower.graph(graph(closed, 4.0))
+        assert cycle.moved is not None and np.asarray(cycle.moved[0]).tolist() == [2.0]
+        far = {**closed, 2: moved(1e9)}
+        assert follower.graph(graph(far, 5.0)) == [] and "node 2 would be 1e+09 m" in told[0]
+
+    def test_a_wild_stamp_of_a_node_is_no_new_session(self) -> None:
+        told: list[str] = []
+        follower = GraphFollower(Options(), told.append)
+        poses = {n: np.eye(4) for n in (1, 2)}
+        found = []
+        for id_, stamp in ((1, 1.0), (2, NAN), (2, 3e9), (1, NAN), (2, 2.0)):
+            said = data(1.0, [node(id_, stamp, np.eye(4), np.ones((1, 3)))], poses)[3]
+            found += follower.data(said)
+        assert [(cycle.stamp, cycle.session) for cycle in found] == [(1.0, 0), (2.0, 0)]
+        assert len(told) == 2
+
     def test_no_node_with_words(self, tmp_path: Path) -> None:
         nothing = np.zeros((0, 3))
         path = write(

@@ -29,6 +29,7 @@ _ENCODINGS = {
     **dict.fromkeys(("mono16", "16UC1"), ("u2", 1)),
     "32FC1": ("f4", 1),
 }
+LATEST = 2.0**31  # s: no clock of ROS goes further
 _MOST_FRAME = 1000  # bytes of a frame's name
 _COMPRESSED_DEPTH = 12  # bytes before the PNG of a compressedDepth picture
 

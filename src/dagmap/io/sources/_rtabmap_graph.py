@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from ...model import Cycle, Floats
+from ...model import Cycle, Floats, RecordingError
 from ._poses import inverse, matrix
-from ._ros import Unusable
-from ._source import Options
+from ._ros import LATEST, Unusable
+from ._source import Options, checked
 
 _STILL = 5e-4  # m, and in a rotation: what moves less has not moved
+_FARTHEST = 5e5  # m from where the session began: what an agent takes
 _AFTER = 1e-3  # s after the last node: when a mere correction is dated
 
 
@@ -22,6 +23,7 @@ class GraphFollower:
     Poses are told in the frame of the session's first node: RTAB-Map may optimise from another
     node, or join an older map, and then moves its map frame as a whole. A graph that shares no
     node with the one before is a new session, and so is one whose nodes were numbered anew.
+    A message counts whole or not at all: what one that raises would have moved, the next one does.
     skip: is told what was left out.
     """
 
@@ -36,9 +38,27 @@ class GraphFollower:
 
     def data(self, message: Any) -> list[Cycle]:
         """The nodes of a MapData that are new, and what has moved. Raises Unusable."""
+        return self._whole(self._data, message)
+
+    def graph(self, message: Any) -> list[Cycle]:
+        """What a MapGraph has moved. Raises Unusable."""
+        return self._whole(lambda m: self._with_moves([], self._moved(self._enter(m))), message)
+
+    def _whole(self, take: Callable[[Any], list[Cycle]], message: Any) -> list[Cycle]:
+        told, stamps = dict(self._told), dict(self._stamps)
+        rest = self._last, self.session, self.map_frame, self.map
+        try:
+            return take(message)
+        except BaseException:
+            self._told, self._stamps = told, stamps
+            self._last, self.session, self.map_frame, self.map = rest
+            raise
+
+    def _data(self, message: Any) -> list[Cycle]:
         stamps = {int(node.id): float(node.stamp) for node in message.nodes}
-        if any(self._stamps.get(id_, stamp) != stamp for id_, stamp in stamps.items()):
-            self._begin_anew()
+        for id_, stamp in stamps.items():
+            if self._stamps.get(id_, stamp) != stamp and abs(stamp) < LATEST:
+                self._begin_anew()
         poses = self._enter(message.graph)
         moved = self._moved(poses)
         found = []
@@ -47,10 +67,6 @@ class GraphFollower:
             if cycle is not None:
                 found.append(cycle)
         return self._with_moves(found, moved)
-
-    def graph(self, message: Any) -> list[Cycle]:
-        """What a MapGraph has moved. Raises Unusable."""
-        return self._with_moves([], self._moved(self._enter(message)))
 
     def _enter(self, graph: Any) -> dict[int, Floats]:
         """Optimised poses by node, in RTAB-Map's map frame."""
@@ -73,7 +89,9 @@ class GraphFollower:
         moved = {}
         for id_ in sorted(poses.keys() & self._told.keys()):
             pose = self.map @ poses[id_]
-            if np.abs(pose - self._told[id_]).max() > _STILL:
+            if np.abs(pose).max() > _FARTHEST:
+                self._skip(f"node {id_} would be {np.abs(pose).max():.3g} m away")
+            elif np.abs(pose - self._told[id_]).max() > _STILL:
                 moved[self._stamps[id_]] = self._told[id_] = pose
         return moved
 
@@ -88,15 +106,21 @@ class GraphFollower:
         if pose is None:
             self._skip(f"node {id_} has no pose")
             return None
-        if not self._last < stamp < np.inf:
+        if not self._last < stamp < LATEST:
             self._skip(f"node {id_}: its stamp {stamp} does not come after {self._last}")
             return None
         points = _chosen(node, self._options)
         if not len(points):
             return None  # a bare wall has no words
+        pose = self.map @ pose
+        try:
+            cycle = checked(Cycle(stamp, pose, points, session=self.session), f"node {id_}")
+        except RecordingError as error:
+            self._skip(str(error))
+            return None
         self._last = self._stamps[id_] = stamp
-        self._told[id_] = self.map @ pose
-        return Cycle(stamp, self._told[id_], points, session=self.session)
+        self._told[id_] = pose
+        return cycle
 
     def _with_moves(self, cycles: list[Cycle], moved: dict[float, Floats]) -> list[Cycle]:
         """The moves go with the first cycle, or in one without points."""

@@ -26,6 +26,7 @@ _FEATURES = """SELECT depth_x, depth_y, depth_z FROM Feature WHERE node_id = ?
     AND depth_x IS NOT NULL ORDER BY response DESC, rowid LIMIT ?"""
 _COUNT = "SELECT count(*) FROM Feature WHERE depth_x IS NOT NULL"
 _INT32, _FLOAT32 = 4, 5  # OpenCV's types, one channel
+_AFTER = 1e-3  # s after the last node: when a mere correction is dated
 _MOST_SMALLER = 1100  # zlib makes nothing smaller than by this factor
 _MAGIC = b"SQLite format 3\0"
 
@@ -87,6 +88,7 @@ class RtabmapDatabase:
             self.skips.note(error)
 
     def _cycles(self) -> Iterator[Cycle]:
+        given: list[_Node] = []  # what is left out cannot be moved
         with _database(self._path) as database:
             for i, node in enumerate(self._nodes):
                 last = i == len(self._nodes) - 1
@@ -96,14 +98,21 @@ class RtabmapDatabase:
                         node.stamp,
                         node.moved if last and node.moved is not None else node.pose,
                         self._chosen(self._positions(node, rows.fetchall())),
-                        moved=self._moves() if last else None,
+                        moved=_moves(given) if last else None,
                         session=node.session,
                     )
                     cycle = checked(cycle, self._path)
                 except RecordingError as error:
                     self.skips.note(error)
                     continue
+                given.append(node)
                 yield cycle
+        moves = _moves(given)
+        if moves is not None and given[-1] is not self._nodes[-1]:  # the one to bring them lacks
+            here, nothing = given[-1], np.zeros((0, 3))
+            pose = here.pose if here.moved is None else here.moved
+            cycle = Cycle(here.stamp + _AFTER, pose, nothing, moved=moves, session=here.session)
+            yield checked(cycle, self._path)
 
     def _positions(self, node: _Node, rows: list[tuple[Any, ...]]) -> Floats:
         """(N, 3) m; SQLite keeps anything in any column."""
@@ -121,13 +130,6 @@ class RtabmapDatabase:
             distance = np.sqrt((points**2).sum(axis=1))
         near = points[(distance > 0) & (distance <= most)]
         return np.asarray(near[: self._options.max_features])
-
-    def _moves(self) -> tuple[Floats, Floats] | None:
-        """Stamps and poses of all nodes but the last that the optimisation has moved."""
-        moved = [(n.stamp, n.moved) for n in self._nodes[:-1] if n.moved is not None]
-        if not moved:
-            return None
-        return np.array([stamp for stamp, _ in moved]), np.array([pose for _, pose in moved])
 
     def _read_nodes(
         self, database: sqlite3.Connection, optimised: dict[int, Floats]
@@ -181,6 +183,14 @@ class RtabmapDatabase:
             if pose is not None:
                 found[int(id_)] = pose
         return found
+
+
+def _moves(nodes: list[_Node]) -> tuple[Floats, Floats] | None:
+    """Stamps and poses of those that the optimisation has moved."""
+    moved = [(n.stamp, n.moved) for n in nodes if n.moved is not None]
+    if not moved:
+        return None
+    return np.array([stamp for stamp, _ in moved]), np.array([pose for _, pose in moved])
 
 
 def unpack_matrix(blob: bytes, kind: int) -> np.ndarray:
