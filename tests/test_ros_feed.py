@@ -6,6 +6,7 @@ import random
 import re
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -116,9 +117,20 @@ class TestBounds:
         feed = Feed(RosConfig())
         give(feed, MAKE.mount())
         for i in range(2000):
-            give(feed, MAKE.odometry(0.1 * i), MAKE.tf(0.1 * i, "x", "y", np.eye(4), False))
+            give(feed, MAKE.odometry(1 + 0.1 * i), MAKE.tf(0.1 * i, "x", "y", np.eye(4), False))
         assert len(feed._poses.trajectory) < 700
         assert len(feed._poses.tree._moving["y"]) < 700
+
+    def test_frames_without_clouds_and_odometry(self) -> None:
+        feed = Feed(RosConfig())
+        for i in range(2000):
+            give(feed, MAKE.tf(0.1 * i, "x", "y", np.eye(4), False))
+        assert len(feed._poses.tree._moving["y"]) < 700
+        many = MAKE.tf(1.0, "map", "a", np.eye(4), False)
+        one = many[3].transforms[0]
+        many[3].transforms = [replace(one, child_frame_id=f"f{i}") for i in range(3000)]
+        give(feed, many)
+        assert len(feed._poses.tree) == 1000
 
     def test_frames(self) -> None:
         feed = Feed(RosConfig())
@@ -144,10 +156,64 @@ class TestStamps:
 
     def test_a_clock_that_starts_anew_is_a_new_session(self) -> None:
         feed = self.ready()
+        with pytest.raises(Unusable, match="its stamp 0.900000 is far from 10.9"):
+            give(feed, MAKE.odometry(0.9))
+        with pytest.raises(Unusable):
+            give(feed, MAKE.odometry(0.95))
         give(feed, MAKE.odometry(1.0), MAKE.odometry(1.1))
         (cycle,) = give(feed, cloud(1.05))
         assert (cycle.session, cycle.stamp) == (1, 1.05)
         assert np.allclose(cycle.pose, MAKE.sensor(1.05), atol=1e-9)  # what is mounted stays
+
+    @pytest.mark.parametrize("stamp", [0.0, 100_000.0])
+    @pytest.mark.parametrize("what", [MAKE.odometry, cloud])
+    def test_a_wild_one_is_no_new_session(
+        self, stamp: float, what: Callable[[float], Message]
+    ) -> None:
+        feed = self.ready()
+        with pytest.raises(Unusable, match="stamp"):
+            give(feed, what(stamp))
+        assert feed.newest < 11
+        (cycle,) = give(feed, cloud(10.85), MAKE.odometry(11.0))
+        assert (cycle.stamp, cycle.session) == (10.85, 0)
+
+
+class TestFrames:
+    def test_one_that_appears_above_the_fixed_one_changes_nothing(self) -> None:
+        feed, found = Feed(RosConfig(odometry="")), []
+        give(feed, MAKE.mount())
+        for i in range(1, 7):
+            give(feed, MAKE.tf(i, "odom", "base_link", pose_at(i), False))
+            if i > 3:
+                give(feed, MAKE.tf(i, "map", "odom", moved(50.0), False))
+            found += give(feed, cloud(i))
+        assert [cycle.session for cycle in found] == [0] * 6
+        for cycle in found:
+            assert np.allclose(cycle.pose, MAKE.sensor(cycle.stamp), atol=1e-9)
+
+    def test_another_fixed_one_is_a_new_session(self) -> None:
+        feed, found = Feed(RosConfig(odometry="")), []
+        give(feed, MAKE.mount())
+        for i in range(6):
+            parent, stamp = ("odom", "other")[i > 2], 1 + 0.1 * i
+            give(feed, MAKE.tf(stamp, parent, "base_link", moved(100.0 * (i > 2)), False))
+            found += give(feed, cloud(stamp))
+        assert [cycle.session for cycle in found] == [0] * 3 + [1] * 3
+        assert len({tuple(np.asarray(cycle.pose)[:3, 3]) for cycle in found}) == 2
+
+    def test_odometry_in_another_one_is_a_new_session(self) -> None:
+        feed = Feed(RosConfig(same_frame=True))
+        found = give(feed, MAKE.odometry(1.0), cloud(1.0))
+        for i in range(1, 6):
+            message = MAKE.odometry(1 + 0.1 * i)[3]
+            header = replace(message.header, frame_id="other")
+            other = ("/odom", "", 0.0, replace(message, header=header))
+            if i < 3:
+                with pytest.raises(Unusable, match="in 'other', the ones before it .* in 'odom'"):
+                    give(feed, other)
+            else:
+                found += give(feed, other, cloud(1 + 0.1 * i))
+        assert [cycle.session for cycle in found] == [0, 1, 1, 1]
 
 
 def test_map_data_feeds_nodes_and_moves() -> None:

@@ -184,10 +184,14 @@ class Bridge(Closing):
             self._picture, self._question = self._question.answer, None
             self._tell_map()
         elif self._question is None and now >= self._next_map:
+            begun = self._next_map > 0  # at first there is nothing to be heard yet
             self._next_map = now + self._config.publish_period
             edges = self._config.max_edges if self._config.graph else 0
             self._question = Question(partial(telling.take_picture, edges=edges))
             self._inbox.put_question(self._question)
+            problem = self._said()[1] if begun else None
+            if problem is not None:
+                self._log.seldom("warning", "no cycles", "feed", reason=problem)
         if now >= self._next_tf:
             self._next_tf = now + self._config.tf_period
             self._tell_frame()

@@ -20,6 +20,8 @@ from .config import RosConfig
 _WAITING = 32  # clouds that wait for their poses
 _KEPT = 30.0  # s of poses behind the newest cloud
 _FRAMES = 1000  # of tf, with a parent each
+_AHEAD = 3600.0  # s: nor does a clock go on by more at once
+_SURE = 3  # messages in a row after which what is odd is so
 _JUMP = 5.0  # s: a clock that goes back by more was started anew, as a bag that is played again
 _EVERY = 200  # messages of poses after which old ones are let go of
 
@@ -55,6 +57,27 @@ class _Cloud:
     colors: Uint8s | None
 
 
+@dataclass(slots=True)
+class _Clock:
+    """The stamps of one topic. A few that do not fit are refused; when more follow, they count."""
+
+    newest: float = -np.inf
+    _odd: float = -np.inf
+    _in_a_row: int = 0
+
+    def went_back(self, stamp: float) -> bool:
+        """Whether the clock was started anew. Raises Unusable where that is not sure."""
+        if self.newest == -np.inf or -_JUMP <= stamp - self.newest <= _AHEAD:
+            self.newest, self._in_a_row = max(self.newest, stamp), 0
+            return False
+        again = -_JUMP <= stamp - self._odd <= _AHEAD
+        self._odd, self._in_a_row = stamp, self._in_a_row + 1 if again else 1
+        if self._in_a_row < _SURE:
+            raise ros.Unusable(f"its stamp {stamp:.6f} is far from {self.newest:.6f}, before it")
+        back, self.newest, self._in_a_row = stamp < self.newest, stamp, 0
+        return back
+
+
 class Feed:
     """The cycles of one robot. Messages are decoded ones, of ROS 1 or 2; `now` is any clock in s.
 
@@ -71,6 +94,9 @@ class Feed:
         self._clouds: deque[_Cloud] = deque()
         self._poses_since = 0
         self._pose_frame = ""
+        self._clocks = {"cloud": _Clock(), "odometry": _Clock()}
+        self._child = ""  # what the odometry is of
+        self._others: list[tuple[str, str]] = []  # (frame, child) of odometry that is another one
         self._poses = self._no_poses()
         self._follower = GraphFollower(self._options, self._skip)
 
@@ -123,7 +149,7 @@ class Feed:
 
     def _cloud(self, role: str, message: Any, now: float) -> None:
         stamp = ros.stamp_of(message)
-        if stamp < self._last - _JUMP:
+        if self._clocks[role].went_back(stamp):
             self._begin_anew()
         if stamp <= max(self._last, self._clouds[-1].stamp if self._clouds else -np.inf):
             raise ros.Unusable(f"its stamp {stamp:.6f} does not come after the one before")
@@ -137,28 +163,49 @@ class Feed:
 
     def _odometry(self, role: str, message: Any, now: float) -> None:
         child, stamp, pose = ros.pose_of(message)
-        if stamp < self._poses.trajectory.newest - _JUMP:
+        ros.stamp_of(message)  # an empty one is none
+        frame = ros.frame_name(str(message.header.frame_id))
+        if self._is_another(frame, child) or self._clocks[role].went_back(stamp):
             self._begin_anew()
-        self._pose_frame = ros.frame_name(str(message.header.frame_id))
+        self._pose_frame, self._child = frame, child
         self._poses.add_pose(child, stamp, pose)
         self.newest = max(self.newest, stamp)
         self._tidy()
+
+    def _is_another(self, frame: str, child: str) -> bool:
+        """Whether odometry is of other frames from now on. Raises Unusable where it is not sure."""
+        if not self._pose_frame or (frame, child) == (self._pose_frame, self._child):
+            self._others.clear()
+            return False
+        if self._others and self._others[-1] != (frame, child):
+            self._others.clear()
+        self._others.append((frame, child))
+        if len(self._others) < _SURE:
+            raise ros.Unusable(
+                f"it tells of {child!r} in {frame!r}, the ones before it of {self._child!r} in "
+                f"{self._pose_frame!r}; one topic for one odometry is wanted"
+            )
+        self._others.clear()
+        return True
 
     def _frames(self, role: str, message: Any, now: float) -> None:
         fleet = self._config.fleet_frame
         found = [each for each in ros.transforms(message) if each[0] != fleet]  # not its own
         tree = self._poses.tree
-        fits = [each for each in found if len(tree) < _FRAMES or tree.knows(each[1])]
-        self._poses.add_frames(fits, still=role == "tf_static")
-        self._tidy()
+        for each in found:
+            if len(tree) < _FRAMES or tree.knows(each[1]):
+                self._poses.add_frames([each], still=role == "tf_static")
+        self._tidy(len(found))
 
-    def _tidy(self) -> None:
-        self._poses_since += 1
+    def _tidy(self, count: int = 1) -> None:
+        self._poses_since += count
         if self._poses_since >= _EVERY:
             self._poses_since = 0
-            oldest = self._clouds[0].stamp if self._clouds else self.newest
-            self._poses.trajectory.forget(oldest - _KEPT)
-            self._poses.tree.forget(oldest - _KEPT)
+            # Where no cloud waits, none will come for what is long past on the topic's own clock.
+            oldest = self._clouds[0].stamp - _KEPT if self._clouds else -np.inf
+            kept = np.inf if self._clouds else _KEPT
+            self._poses.trajectory.forget(oldest, kept)
+            self._poses.tree.forget(oldest, kept)
 
     def _ready(self, now: float) -> list[Cycle]:
         """The oldest clouds, as far as their poses are known or will not be waited for."""
@@ -179,9 +226,15 @@ class Feed:
                 self._drop(why)
                 continue
             if not self._config.odometry:
-                self._pose_frame = self._poses.fixed(cloud.frame)
+                self._hold(self._poses.fixed(cloud.frame))
             out += self._made(cloud, pose)
         return out
+
+    def _hold(self, fixed: str) -> None:
+        """Cycles of one session are in one frame: where tf leads to it no more, another begins."""
+        if self._poses.held and fixed != self._poses.held and self._last > -np.inf:
+            self._session += 1
+        self._pose_frame = self._poses.held = fixed
 
     def _made(self, cloud: _Cloud, pose: Floats) -> list[Cycle]:
         cycle = Cycle(cloud.stamp, pose, cloud.points, colors=cloud.colors)
@@ -200,7 +253,7 @@ class Feed:
             raise ros.Unusable(str(error)) from None
 
     def _begin_anew(self) -> None:
-        """The clock went back: nothing of before belongs to what comes now."""
+        """The clock or the odometry is another one: nothing of before belongs to what comes."""
         still = self._poses.tree.still
         self._clouds.clear()
         self._poses = self._no_poses()
@@ -208,6 +261,8 @@ class Feed:
         if self._last > -np.inf:
             self._session += 1
         self._last = self.newest = -np.inf
+        self._clocks = {"cloud": _Clock(), "odometry": _Clock()}
+        self._pose_frame = self._child = ""
 
     def _no_poses(self) -> SensorPoses:
         config = self._config

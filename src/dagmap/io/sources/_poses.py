@@ -77,8 +77,11 @@ class Trajectory:
         """The last stamp; -inf where there is none."""
         return max(self._rows, default=-np.inf)
 
-    def forget(self, before: float) -> None:
-        """Let go of what is older."""
+    def forget(self, before: float, kept: float = np.inf) -> None:
+        """Let go of what is older than that, and than `kept` s before the one that came last."""
+        if not self._rows:
+            return
+        before = max(before, next(reversed(self._rows)) - kept)
         self._rows = {stamp: pose for stamp, pose in self._rows.items() if stamp >= before}
         self._stamps = None
 
@@ -111,7 +114,10 @@ class FrameTree:
     _still: dict[str, Floats] = field(default_factory=dict)
 
     def add(self, parent: str, child: str, stamp: float | None, pose: Floats) -> None:
-        """stamp: None for what never moves."""
+        """stamp: None for what never moves. What was told of another parent counts no more."""
+        if self._parents.get(child, parent) != parent:
+            self._moving.pop(child, None)
+            self._still.pop(child, None)
         self._parents[child] = parent
         if stamp is None:
             self._still[child] = pose
@@ -144,10 +150,10 @@ class FrameTree:
         moving = (self._moving[child] for child in apart if child in self._moving)
         return min((each.newest for each in moving), default=np.inf)
 
-    def forget(self, before: float) -> None:
-        """Let go of poses that are older."""
+    def forget(self, before: float, kept: float = np.inf) -> None:
+        """Let go of poses that are older, as `Trajectory` does."""
         for trajectory in self._moving.values():
-            trajectory.forget(before)
+            trajectory.forget(before, kept)
 
     def connects(self, target: str, frame: str) -> bool:
         return bool(set(self.above(target)) & set(self.above(frame)))
@@ -185,6 +191,7 @@ class SensorPoses:
         self._where, self.topic = where, topic
         self._named, self._same_frame = fixed, same_frame
         self.trajectory, self.tree, self._child = Trajectory(), FrameTree(), ""
+        self.held = ""  # the fixed frame while tf leads to it, whatever is told to be above it
 
     def add_pose(self, child: str, stamp: float, pose: Floats) -> None:
         """A pose of the topic. child: what it is the pose of, "" where it does not say."""
@@ -251,6 +258,8 @@ class SensorPoses:
                 f"{self._where}: no tf leads to {frame!r}, the sensor's frame; record /tf and "
                 "/tf_static too, or name a topic with poses by --topic"
             )
+        if self.held in above:
+            return self.held
         return next((name for name in _FIXED if name in above), above[-1])
 
 

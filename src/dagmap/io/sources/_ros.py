@@ -59,10 +59,17 @@ def frame_name(name: str) -> str:
 def stamp_of(message: Any) -> float:
     """s, of the header. Raises Unusable where it is empty."""
     stamp = message.header.stamp
-    seconds = stamp.sec + stamp.nanosec / 1e9
+    seconds = _seconds(stamp)
     if not seconds:
         raise Unusable("its header has no stamp; the driver must give it one")
-    return float(seconds)
+    return seconds
+
+
+def _seconds(stamp: Any) -> float:
+    seconds = float(stamp.sec + stamp.nanosec / 1e9)
+    if not 0 <= seconds < LATEST:
+        raise Unusable(f"its stamp {seconds:.6f} is none that a clock shows")
+    return seconds
 
 
 def cloud_arrays(message: Any) -> tuple[Floats, Uint8s | None]:
@@ -171,13 +178,13 @@ def pose_of(message: Any) -> tuple[str, float, Floats]:
 
     Raises Unusable.
     """
-    pose, stamp = message.pose, message.header.stamp
+    pose, stamp = message.pose, _seconds(message.header.stamp)
     pose = getattr(pose, "pose", pose)
     found = _matrix(pose.position, pose.orientation)
     if found is None:
         raise Unusable("its orientation is no unit quaternion, or its position not finite")
     child = frame_name(getattr(message, "child_frame_id", ""))
-    return child, stamp.sec + stamp.nanosec / 1e9, found
+    return child, stamp, found
 
 
 def transforms(message: Any) -> list[tuple[str, str, float, Floats]]:
@@ -186,8 +193,8 @@ def transforms(message: Any) -> list[tuple[str, str, float, Floats]]:
     for item in message.transforms:
         pose = _matrix(item.transform.translation, item.transform.rotation)
         stamp = item.header.stamp
-        if pose is not None:
-            seconds = stamp.sec + stamp.nanosec / 1e9
+        seconds = float(stamp.sec + stamp.nanosec / 1e9)
+        if pose is not None and 0 <= seconds < LATEST:
             frames = frame_name(item.header.frame_id), frame_name(item.child_frame_id)
             found.append((*frames, seconds, pose))
     return found
