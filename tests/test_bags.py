@@ -331,6 +331,9 @@ def test_what_is_no_bag_is_named(tmp_path: Path) -> None:
         with pytest.raises(RecordingError, match=f"{name}: damaged, cut short, or of another"):
             open_source(path)
     (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "metadata.yaml").touch()
+    with pytest.raises(RecordingError, match="metadata.yaml: an empty file"):
+        open_source(tmp_path / "bag")
     (tmp_path / "bag" / "metadata.yaml").write_text(
         "rosbag2_bagfile_information: {version: 99, relative_file_paths: []}"
     )

@@ -153,6 +153,11 @@ def later(mav: Path) -> None:
     (mav / "cam1" / "data.csv").write_text(lines)
 
 
+def tiny(mav: Path) -> None:
+    for camera in (0, 1):
+        sensor(camera, resolution="[8, 8]")(mav)
+
+
 def swapped(mav: Path) -> None:
     for a, b in (("cam0", "x"), ("cam1", "cam0"), ("x", "cam1")):
         (mav / a).rename(mav / b)
@@ -180,6 +185,7 @@ FAR = "[1,0,0,0, 0,1,0,500, 0,0,1,0, 0,0,0,1]"
         (sensor(0, distortion_coefficients="[1]"), "is no list of 0 or 4 or 5 numbers"),
         (sensor(1, T_BS=FAR), "5e.02 m apart by their T_BS|500 m apart by their T_BS"),
         (sensor(1, resolution="[320, 241]"), "cam0 has .320, 240. pixels, cam1 .320, 241."),
+        (tiny, "pictures of 8 x 8 pixels by sensor.yaml; 32 x 32 at least"),
         (swapped, "cam0 is the right camera by T_BS; swap"),
         (later, "not synchronised: the nearest of their 5 and 5 pictures are 20 ms apart"),
         (write("cam0/data.csv", "#none\n"), "cam0: an empty recording"),

@@ -73,7 +73,7 @@ class _Clock:
         again = -_JUMP <= stamp - self._odd <= _AHEAD
         self._odd, self._in_a_row = stamp, self._in_a_row + 1 if again else 1
         if self._in_a_row < _SURE:
-            raise ros.Unusable(f"its stamp {stamp:.6f} is far from {self.newest:.6f}, before it")
+            raise ros.Unusable(f"its stamp {stamp:.6f} is far from that of the one before")
         back, self.newest, self._in_a_row = stamp < self.newest, stamp, 0
         return back
 

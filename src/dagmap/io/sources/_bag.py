@@ -44,8 +44,9 @@ class Bag:
         self._typesys = _import(path, "rosbags.typesys")
         self.ros2 = path.suffix != ".bag"
         self._salvaged = False
-        if path.is_file() and not path.stat().st_size:
-            raise RecordingError(f"{path}: an empty file; copy or record it anew")
+        index = path / "metadata.yaml" if path.is_dir() else path
+        if index.is_file() and not index.stat().st_size:
+            raise RecordingError(f"{index}: an empty file; copy or record it anew")
         try:
             self.topics, self._types = self._look()
         except Exception as error:  # noqa: BLE001  whatever a foreign parser raises on such bytes
@@ -159,5 +160,7 @@ def _import(path: Path, name: str) -> Any:
 
 
 def _first_line(error: Exception) -> str:
+    if isinstance(error, (TypeError, AttributeError)):  # Python's own words help nobody
+        return "its parts do not fit together"
     text = str(error).strip().split("\n")[0][:200]
     return text or type(error).__name__

@@ -20,6 +20,7 @@ _MOST_DISPARITY = 512  # pixels, a whole number of sixteenths
 _LEAST_DISPARITY = 5.0
 _BLOCK = 7  # pixels, edge of what is compared
 _MOST_PIXELS = 1 << 26
+_LEAST_SIDE = 32  # pixels: in smaller pictures the matcher has no place to look
 _LARGEST = 1e6  # of a number of a calibration, m or pixels
 _MODELS = {
     "radial-tangential": False,
@@ -132,6 +133,11 @@ class Stereo:
         if left.size != right.size:
             raise RecordingError(
                 f"{path}: cam0 has {left.size} pixels, cam1 {right.size}; both alike are wanted"
+            )
+        if min(left.size) < _LEAST_SIDE:
+            raise RecordingError(
+                f"{path}: pictures of {left.size[0]} x {left.size[1]} pixels by sensor.yaml; "
+                f"{_LEAST_SIDE} x {_LEAST_SIDE} at least are wanted"
             )
         # Turning both into one plane asks for no lens; what the lens does goes into the maps.
         turned = cv2.stereoRectify(
