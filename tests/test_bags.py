@@ -438,3 +438,20 @@ def test_a_cloud_in_another_byte_order(tmp_path: Path) -> None:
     points, colors = ros.cloud_arrays(said)
     assert points.tolist() == [[1, 0, 0], [2, 0, 0]]
     assert colors is None
+
+
+def test_a_definition_of_which_four_bytes_hold_millions_is_refused(tmp_path: Path) -> None:
+    header = struct.pack("<III", 1, 100, 0) + struct.pack("<I", 5) + b"lidar"
+    rule = "=" * 80
+    definition = (
+        f"Header header\nstd_msgs/Empty[] fields\n{rule}\nMSG: std_msgs/Header\nuint32 seq\n"
+        f"time stamp\nstring frame_id\n{rule}\nMSG: std_msgs/Empty\n"
+    )
+    known = "2a07272eca11fef21f9464636e783977"  # by which rosbags takes it for the real one
+    with Writer(tmp_path / "a.bag") as writer:
+        topic = writer.add_connection(
+            "/points", "sensor_msgs/msg/PointCloud2", msgdef=definition, md5sum=known
+        )
+        writer.write(topic, 100 * 10**9, header + struct.pack("<I", (1 << 32) - 1))
+    with pytest.raises(RecordingError, match=r"a\.bag: a definition repeats std_msgs/msg/Empty"):
+        list(open_source(tmp_path / "a.bag"))

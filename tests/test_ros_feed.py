@@ -27,7 +27,7 @@ from dagmap.io.ros.types import Types
 from dagmap.io.runtime import Counts
 from dagmap.io.settings import load_settings
 from dagmap.io.sources._poses import inverse
-from dagmap.io.sources._ros import Unusable, cloud_arrays, transforms
+from dagmap.io.sources._ros import Unusable, boundless, cloud_arrays, transforms
 from dagmap.model import ConfigError
 from test_rtabmap_msgs import data, drift, graph, moved, node
 
@@ -319,6 +319,23 @@ def test_of_messages_that_wait_the_oldest_are_dropped() -> None:
     for _ in range(7):
         assert backlog.take(0.0) is not None
     assert backlog.take(0.0) is None
+
+
+@pytest.mark.parametrize("ros2", [True, False])
+def test_the_published_definitions_are_bounded(ros2: bool) -> None:
+    assert boundless(Types(ros2)._store.fielddefs) is None
+
+
+@pytest.mark.parametrize("field", ["std_msgs/Empty[] all", "std_msgs/Empty[1000000] all", "A a"])
+def test_a_type_of_which_four_bytes_hold_millions_is_not_learnt(field: str) -> None:
+    inner = "\n".join(["", "=" * 80, "MSG: evil/A", "std_msgs/Empty[] all"])
+    with pytest.raises(Unusable, match="repeats std_msgs/msg/Empty, which is empty"):
+        Types(False).learn("evil/msg/X", field + (inner if field == "A a" else ""))
+
+
+def test_a_stamp_that_ros_cannot_say_does_not_silence_the_robot(agent: Agent) -> None:
+    raw = telling.map_message(Types(True), agent.map, 3e9, "fleet", 1000)
+    assert Types(True).decode(telling.CLOUD, raw).header.stamp.sec == (1 << 31) - 1
 
 
 def test_what_ros_1_sends_along_is_learnt() -> None:

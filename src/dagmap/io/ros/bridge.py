@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 
-from ...model import Cycle, DagmapError
+from ...model import Cycle, DagmapError, NetworkError
 from ..closing import Closing
 from ..log import Log
 from ..queues import Inbox, Question
@@ -149,6 +149,11 @@ class Bridge(Closing):
                 self._step()
         except DagmapError as error:
             self.error = error
+        except Exception as error:  # noqa: BLE001  a robot that hears nothing more must say so
+            self.error = NetworkError(
+                f"[ros]: a message could not be worked with ({type(error).__name__}: {error}); "
+                "start the robot again"
+            )
 
     def _step(self) -> None:
         now = time.monotonic()

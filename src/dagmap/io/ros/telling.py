@@ -17,6 +17,7 @@ CLOUD = "sensor_msgs/msg/PointCloud2"
 MARKERS = "visualization_msgs/msg/MarkerArray"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
+_LAST = float((1 << 31) - 1)  # s, of a stamp of ROS 2
 _ROW = np.dtype(
     [
         *((axis, "<f4") for axis in "xyz"),
@@ -90,8 +91,8 @@ def _edges(runtime: Runtime, most: int) -> Floats:
 
 
 def header(types: Types, stamp: float, frame: str) -> Any:
-    """stamp: s on the robot's clock."""
-    nanoseconds = round(max(stamp, 0.0) * 1e9)
+    """stamp: s on the robot's clock; beyond what ROS can say it is the last."""
+    nanoseconds = round(min(max(stamp, 0.0), _LAST) * 1e9)
     time = types.make(
         "builtin_interfaces/msg/Time", sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9
     )

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...model import NetworkError
-from ..sources._ros import Unusable
+from ..sources._ros import Unusable, boundless
 from ..sources._rtabmap_msgs import register
 
 _TRANSFORMS = "geometry_msgs/TransformStamped[] transforms"
@@ -46,7 +46,12 @@ class Types:
         try:
             found = self._typesys.get_types_from_msg(definition, kind)
             known = self._store.types
-            self._store.register({name: it for name, it in found.items() if name not in known})
+            new = {name: it for name, it in found.items() if name not in known}
+            if (name := boundless({**self._store.fielddefs, **new})) is not None:
+                raise Unusable(f"the definition of {kind[:80]} repeats {name[:80]}, which is empty")
+            self._store.register(new)
+        except Unusable:
+            raise
         except Exception as error:  # noqa: BLE001  whatever a foreign parser raises on such bytes
             raise Unusable(f"the definition of {kind[:80]} cannot be read ({error})") from None
 

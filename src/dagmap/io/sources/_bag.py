@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from ...model import RecordingError
-from ._ros import Unusable
+from ._ros import Unusable, boundless
 from ._rtabmap_msgs import register
 from ._salvage import Cut, Record, mcap_records, ros1_records
 from ._source import Skips
@@ -53,6 +53,11 @@ class Bag:
             self._note(f"damaged, cut short, or of another version ({_first_line(error)})")
             self._salvaged = True
             self.topics, self._types = self._look_at_records()
+        if (name := boundless(self._types.fielddefs)) is not None:
+            raise RecordingError(
+                f"{path}: a definition repeats {name[:60]}, which is empty, so that a message may "
+                "claim any number of them; record it anew with the published definitions"
+            )
 
     def messages(self, topics: set[str]) -> Iterator[Message]:
         """The messages of some topics in the order in which they were recorded."""

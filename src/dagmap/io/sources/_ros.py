@@ -30,6 +30,8 @@ _ENCODINGS = {
     "32FC1": ("f4", 1),
 }
 LATEST = 2.0**31  # s: no clock of ROS goes further
+_FILLER = "structure_needs_at_least_one_member"  # of what is empty; in ROS 1 it takes no bytes
+_NAME, _ARRAY, _SEQUENCE = 2, 3, 4  # kinds of fields in rosbags' definitions
 _MOST_FRAME = 1000  # bytes of a frame's name
 _COMPRESSED_DEPTH = 12  # bytes before the PNG of a compressedDepth picture
 
@@ -54,6 +56,23 @@ def peek(raw: bytes, ros2: bool) -> tuple[float, str]:
 def frame_name(name: str) -> str:
     """ROS 1 allowed a slash before it, ROS 2 writes its terminating zero."""
     return name.rstrip("\0").lstrip("/")
+
+
+def boundless(fielddefs: Any) -> str | None:
+    """The name of a type that is repeated without taking bytes, so that a few bytes can claim any
+    number of them; None where there is none. fielddefs: of a typestore of rosbags."""
+
+    def takes_none(what: Any) -> bool:
+        kind, of = int(what[0]), what[1]
+        if kind == _NAME and of in fielddefs:
+            return all(takes_none(inner) for name, inner in fielddefs[of][1] if name != _FILLER)
+        return kind == _ARRAY and (of[1] == 0 or takes_none(of[0]))
+
+    for _, fields in fielddefs.values():
+        for _, (kind, of) in fields:
+            if int(kind) in (_ARRAY, _SEQUENCE) and takes_none(of[0]):
+                return str(of[0][1])
+    return None
 
 
 def stamp_of(message: Any) -> float:
