@@ -84,7 +84,7 @@ def seeds() -> Iterable[bytes]:
     yield pack([rig[0], (rig[1][0], up), *pictures])
     small = rig[1][1].replace(b"48, 32", b"48, 31")
     yield pack([rig[0], (rig[1][0], small), *pictures])
-    both = [(name, text.replace(b"48, 32", b"48, 31")) for name, text in rig]
+    both = [(name, text.replace(b"48, 32", b"48, 33")) for name, text in rig]
     yield pack([*both, *pictures])
     yield pack([(rig[0][0], rig[0][1].replace(b"60, 60", b"0, 60")), rig[1], *pictures])
     yield pack([(rig[0][0], rig[0][1].replace(b"60, 60", b"60, x")), rig[1], *pictures])
