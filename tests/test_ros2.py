@@ -234,7 +234,7 @@ def test_rtabmap_feeds_a_robot_and_its_closures_move_the_map(
             walls = np.array([[-4, 4], [-3, 3], [-1, 2]])
             return bool(np.abs(places[:, :, None] - walls).min(axis=(1, 2)).max() < 0.003)
 
-        until(lambda: a.answer()["cycles"] == 5, "four nodes and the closure")
+        until(lambda: a.answer()["cycles"] >= 4, "four nodes")  # the closure may overtake some
         until(straight, "the map that the closure straightens")
         until(lambda: ros.last("/tf"), "a transform")
         assert ros.last("/tf").transforms[0].child_frame_id == "map"

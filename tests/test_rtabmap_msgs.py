@@ -257,6 +257,31 @@ class TestSessions:
         a = data(1.0, [node(1, 1.0, np.eye(4), self.one)], {1: np.eye(4)})
         assert len(self.follow(a, a)) == 1
 
+    @pytest.mark.parametrize("overtakes", range(5))
+    def test_a_graph_that_overtakes_nodes_counts_all_the_same(self, overtakes: int) -> None:
+        """Topics come by ways of their own; an older graph must not bend the map again."""
+        *nodes, closure = mapping()
+        follower = GraphFollower(Options(), lambda what: None)
+        poses: dict[float, Any] = {}
+        for topic, _, _, said in [*nodes[:overtakes], closure, *nodes[overtakes:]]:
+            for cycle in follower.graph(said) if "Graph" in topic else follower.data(said):
+                if cycle.moved is not None:
+                    poses |= zip(*(np.asarray(each).tolist() for each in cycle.moved), strict=True)
+                if len(cycle.points):
+                    poses[float(cycle.stamp)] = cycle.pose
+        assert {*poses} == {1.0, 2.0, 3.0, 4.0}
+        for stamp, pose in poses.items():
+            assert np.allclose(pose, drift(1) @ pose_at(stamp), atol=1e-6), stamp
+
+    def test_an_older_graph_brings_nodes_that_the_newest_one_does_not_have(self) -> None:
+        truth = {n: moved(float(n)) for n in (1, 2, 3)}
+        shift = pose_at(30.0)
+        _, third = self.follow(
+            data(5.0, [node(1, 1.0, truth[1], self.one)], {n: truth[n] for n in (1, 2)}),
+            data(4.0, [node(3, 3.0, truth[3], self.one)], {n: shift @ truth[n] for n in (1, 2, 3)}),
+        )
+        assert third.moved is None and np.allclose(third.pose, truth[3])
+
     def test_fields_as_ros_1_calls_them(self) -> None:
         said = data(1.0, [node(1, 1.0, np.eye(4), self.one)], {1: moved(2.0)})[3]
         old = SimpleNamespace(

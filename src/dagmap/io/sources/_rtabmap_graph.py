@@ -15,6 +15,7 @@ from ._source import Options, checked
 _STILL = 5e-4  # m, and in a rotation: what moves less has not moved
 _FARTHEST = 5e5  # m from where the session began: what an agent takes
 _AFTER = 1e-3  # s after the last node: when a mere correction is dated
+_LATE = 5.0  # s: a graph that is older than the newest one by more is of another clock
 
 
 class GraphFollower:
@@ -23,6 +24,7 @@ class GraphFollower:
     Poses are told in the frame of the session's first node: RTAB-Map may optimise from another
     node, or join an older map, and then moves its map frame as a whole. A graph that shares no
     node with the one before is a new session, and so is one whose nodes were numbered anew.
+    The newest graph counts: topics overtake each other, and an older one moves nothing back.
     A message counts whole or not at all: what one that raises would have moved, the next one does.
     skip: is told what was left out.
     """
@@ -32,6 +34,7 @@ class GraphFollower:
         self._told: dict[int, Floats] = {}  # pose by node
         self._stamps: dict[int, float] = {}
         self._last = -np.inf
+        self._newest: tuple[float, dict[int, Floats]] = -np.inf, {}  # stamp and poses of a graph
         self.session = 0
         self.map_frame = ""  # what RTAB-Map calls it
         self.map: Floats = np.eye(4)  # pose of RTAB-Map's map frame in the session's frame
@@ -46,12 +49,12 @@ class GraphFollower:
 
     def _whole(self, take: Callable[[Any], list[Cycle]], message: Any) -> list[Cycle]:
         told, stamps = dict(self._told), dict(self._stamps)
-        rest = self._last, self.session, self.map_frame, self.map
+        rest = self._last, self._newest, self.session, self.map_frame, self.map
         try:
             return take(message)
         except BaseException:
             self._told, self._stamps = told, stamps
-            self._last, self.session, self.map_frame, self.map = rest
+            self._last, self._newest, self.session, self.map_frame, self.map = rest
             raise
 
     def _data(self, message: Any) -> list[Cycle]:
@@ -70,7 +73,11 @@ class GraphFollower:
 
     def _enter(self, graph: Any) -> dict[int, Floats]:
         """Optimised poses by node, in RTAB-Map's map frame."""
-        poses = optimised(graph)
+        poses, stamp = optimised(graph), _stamp(graph)
+        newest, counting = self._newest
+        if newest - _LATE <= stamp < newest:
+            return _brought_over(poses, counting)
+        self._newest = stamp, poses
         self.map_frame = str(graph.header.frame_id).lstrip("/")
         known = poses.keys() & self._told.keys()
         if known:
@@ -81,7 +88,7 @@ class GraphFollower:
         return poses
 
     def _begin_anew(self) -> None:
-        self._told, self._stamps, self._last = {}, {}, -np.inf
+        self._told, self._stamps, self._last, self._newest = {}, {}, -np.inf, (-np.inf, {})
         self.session, self.map = self.session + 1, np.eye(4)
 
     def _moved(self, poses: dict[int, Floats]) -> dict[float, Floats]:
@@ -146,6 +153,21 @@ def optimised(graph: Any) -> dict[int, Floats]:
         raise Unusable(f"{len(ids)} nodes are named, {len(graph.poses)} poses are there")
     found = {id_: _pose(pose) for id_, pose in zip(ids, graph.poses, strict=True) if id_ > 0}
     return {id_: pose for id_, pose in found.items() if pose is not None}
+
+
+def _stamp(graph: Any) -> float:
+    stamp = graph.header.stamp
+    return float(stamp.sec + stamp.nanosec / 1e9)
+
+
+def _brought_over(old: dict[int, Floats], new: dict[int, Floats]) -> dict[int, Floats]:
+    """The new poses, and those of nodes that only the old graph has, in the new one's frame."""
+    common = old.keys() & new.keys()
+    if not common:
+        return new
+    first = min(common)
+    shift = new[first] @ inverse(old[first])
+    return {**{id_: shift @ pose for id_, pose in old.items()}, **new}
 
 
 def _chosen(node: Any, options: Options) -> Floats:
