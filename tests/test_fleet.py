@@ -106,7 +106,7 @@ class TestAgreement:
         with running(a, b, c):
             for robot in (a, b, c):
                 robot.start("--speed", 20, "--wait-for", 2)  # b and c are in each other's reach
-            until(lambda: agreed(a, b, c, authors=3), "agreement")
+            assert until(lambda: agreed(a, b, c, authors=3), "agreement")
 
     def test_a_partition_heals(
         self, nursery: Nursery, tmp_path: Path, recordings: list[Path]

@@ -125,7 +125,7 @@ class TestStrangers:
         a = enroll(nursery, fleet, "a", recordings[0])
         b = enroll(nursery, fleet, "b", recordings[1], a)
         stranger = enroll(nursery, other, "stranger", recordings[2], a, b)
-        self.keeps_out(a, b, stranger)
+        assert self.kept_out(a, b, stranger)
 
     def test_an_expired_certificate(
         self, nursery: Nursery, fleet: keys.Fleet, recordings: list[Path]
@@ -136,7 +136,7 @@ class TestStrangers:
         robot, key = keys.open_robot(late.keys), keys._private_key(fleet.folder / "fleet.key")
         expired = make_leaf(key, "office", robot.identity.public_key, "late", (), days=-1)
         (late.keys / "tls.pem").write_bytes(expired)
-        self.keeps_out(a, b, late)
+        assert self.kept_out(a, b, late)
         with running(a, b, late):  # what it wrote meanwhile counts, once its certificate holds
             for one in (a, b):
                 one.start("--speed", 50)
@@ -159,10 +159,12 @@ class TestStrangers:
         other = make_fleet(elsewhere, "office" if same_name else "pirates")
         a = enroll(nursery, fleet, "a", recordings[0], tls=False)
         b = enroll(nursery, fleet, "b", recordings[1], a, tls=False)
-        self.keeps_out(a, b, enroll(nursery, other, "stranger", recordings[2], a, b, tls=False))
+        assert self.kept_out(
+            a, b, enroll(nursery, other, "stranger", recordings[2], a, b, tls=False)
+        )
 
     @staticmethod
-    def keeps_out(a: Enrolled, b: Enrolled, stranger: Enrolled) -> None:
+    def kept_out(a: Enrolled, b: Enrolled, stranger: Enrolled) -> bool:
         with running(a, b, stranger):
             for robot in (stranger, a, b):
                 robot.start("--speed", 20)
@@ -173,7 +175,7 @@ class TestStrangers:
             outcast = stranger.status()
             assert outcast["peers"] == {} and outcast["traffic"]["received"] == {}
             assert outcast["author"] not in a.answer()["peers"].keys() | b.answer()["peers"].keys()
-            assert [robot.stop() for robot in (a, b, stranger)] == [0, 0, 0]
+            return [robot.stop() for robot in (a, b, stranger)] == [0, 0, 0]
 
     def test_a_robot_that_shows_anothers_certificate_does_not_start(
         self, nursery: Nursery, fleet: keys.Fleet, recordings: list[Path]

@@ -177,7 +177,7 @@ class TestMistakes:
     def test_the_ledger_of_another_fleet(self, nursery: Nursery, tmp_path: Path) -> None:
         robot = Robot(nursery, tmp_path, "a")
         Store.open(_made(robot.ledger), b"anothers").close()
-        self._refused(robot, "ledger.db: the ledger of fleet", "correct `fleet`")
+        assert self._refused(robot, "ledger.db: the ledger of fleet", "correct `fleet`")
 
     def test_the_ledger_of_another_robot(self, nursery: Nursery, tmp_path: Path) -> None:
         a, b = (Robot(nursery, tmp_path, name) for name in "ab")
@@ -185,7 +185,7 @@ class TestMistakes:
             a.start("--until-agreed", 0.1)
             assert a.wait() == 0
         _made(b.ledger).write_bytes(a.ledger.read_bytes())
-        self._refused(b, "ledger.db: the ledger of robot", "a file of its own")
+        assert self._refused(b, "ledger.db: the ledger of robot", "a file of its own")
 
     def test_a_key_without_its_ledger(self, nursery: Nursery, tmp_path: Path) -> None:
         robot = Robot(nursery, tmp_path, "a")
@@ -193,7 +193,7 @@ class TestMistakes:
             robot.start("--until-agreed", 0.1)
             assert robot.wait() == 0
         robot.ledger.unlink()
-        self._refused(robot, "ledger.db: the ledger of the robot's key is gone", "backup")
+        assert self._refused(robot, "ledger.db: the ledger of the robot's key is gone", "backup")
         assert not robot.ledger.exists()
 
     def test_a_key_that_others_can_read(self, nursery: Nursery, tmp_path: Path) -> None:
@@ -205,10 +205,10 @@ class TestMistakes:
         assert key.stat().st_mode & 0o777 == 0o600
         assert key.read_text().strip() not in robot.log + robot.said
         key.chmod(0o644)
-        self._refused(robot, "robot.key: others can read", "chmod 600")
+        assert self._refused(robot, "robot.key: others can read", "chmod 600")
         key.chmod(0o600)
         key.write_text("not a key")
-        self._refused(robot, "robot.key: damaged", "backup")
+        assert self._refused(robot, "robot.key: damaged", "backup")
 
     def test_two_processes_on_one_ledger(self, nursery: Nursery, tmp_path: Path) -> None:
         robot = Robot(nursery, tmp_path, "a")
@@ -216,7 +216,7 @@ class TestMistakes:
         with running(robot):
             robot.start()
             until(robot.status)
-            self._refused(second, "ledger.db: cannot be opened: another process")
+            assert self._refused(second, "ledger.db: cannot be opened: another process")
             assert robot.answer()  # which goes on
 
     def test_parameters_under_which_the_ledger_does_not_hold(
@@ -228,7 +228,7 @@ class TestMistakes:
             assert robot.wait() == 0
         before = robot.ids()
         robot.parameters = robot.parameters.replace("bits = 0", "bits = 20")
-        self._refused(robot, "do not hold under this configuration", "fleet-wide parameters")
+        assert self._refused(robot, "do not hold under this configuration", "fleet-wide parameters")
         assert robot.ids() == before
 
     def test_a_port_in_use(self, nursery: Nursery, tmp_path: Path) -> None:
@@ -237,7 +237,7 @@ class TestMistakes:
         with running(a):
             a.start()
             until(a.status)
-            self._refused(b, f"network (tcp/127.0.0.1:{a.port})", "Address already in use")
+            assert self._refused(b, f"network (tcp/127.0.0.1:{a.port})", "Address already in use")
 
     @pytest.mark.parametrize(
         ("line", "message"),
@@ -251,16 +251,18 @@ class TestMistakes:
     def test_a_configuration_that_makes_no_sense(
         self, nursery: Nursery, tmp_path: Path, line: str, message: str
     ) -> None:
-        self._refused(Robot(nursery, tmp_path, "a", more=line), message)
+        assert self._refused(Robot(nursery, tmp_path, "a", more=line), message)
 
     @staticmethod
-    def _refused(robot: Robot, *words: str) -> None:
+    def _refused(robot: Robot, *words: str) -> str:
+        """Its last words, with those among them."""
         with running(robot):
             robot.start()
             assert robot.wait() == 2, robot.log
         last = robot.log.splitlines()[-1]
         assert last.startswith("dagmap: ") and all(word in last for word in words), robot.log
         assert "Traceback" not in robot.log
+        return last
 
 
 @contextmanager

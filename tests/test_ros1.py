@@ -177,7 +177,7 @@ def test_the_launch_file_starts_three_robots(tmp_path: Path) -> None:
             for topic in maps:
                 until(lambda topic=topic: listener.last(topic), f"a map on {topic}")
             launch.send_signal(signal.SIGINT)  # as Ctrl-C: roslaunch ends its nodes
-            launch.wait(60)
+            assert launch.wait(60) == 0
 
 
 def _subscriptions(port: int) -> set[str]:

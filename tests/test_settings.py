@@ -66,7 +66,9 @@ class TestFile:
         bounds = [f"ledger.{key}" for key in config.ledger.__struct_fields__]
         network = config.network.__struct_fields__
         bounds += [f"network.{key}" for key in network if re.search("bytes|messages|_remem", key)]
-        assert set(bounds) <= rows.keys() and len(bounds) == 13
+        spread = config.sync.__struct_fields__
+        bounds += [f"sync.{key}" for key in spread if not key.endswith("period")]
+        assert set(bounds) <= rows.keys() and len(bounds) == 17
 
 
 class TestMistakes:

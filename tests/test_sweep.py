@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from dagmap import fold, graph, ledger, sync, transaction
+from dagmap import fold, graph, ledger, transaction
 from dagmap.consensus import Consensus
 from dagmap.contribution import Author
 from dagmap.kernels import lattice
@@ -26,6 +26,7 @@ from dagmap.sim.network import Partition
 from dagmap.sim.robot import Happening, Restarted, Robot
 from dagmap.sim.scenario import Liars, Scenario, load_scenario
 from dagmap.sim.sweep import Failure, attempt, minimised, sweep, timeline_of
+from dagmap.sync import Sync
 
 FOLDER = Path(__file__).parents[1] / "scenarios"
 NAMES = ["wifi", "crashes", "partitions", "reach", "liars", "loops", "busy", "frames"]
@@ -169,12 +170,22 @@ def forgetful_waiting_room(patch: pytest.MonkeyPatch) -> None:
 
 def endless_peers(patch: pytest.MonkeyPatch) -> None:
     """Whoever is named as a sender is remembered."""
-    patch.setattr(sync, "MAX_PEERS", 1 << 30)
+    without_bound(patch, "peers_remembered")
 
 
 def endless_questions(patch: pytest.MonkeyPatch) -> None:
     """What was asked about is remembered, whatever comes after it."""
-    patch.setattr(sync, "_MAX_HEADS", 1 << 20)
+    without_bound(patch, "heads_remembered")
+
+
+def without_bound(patch: pytest.MonkeyPatch, name: str) -> None:
+    begin = Sync.__init__
+
+    def careless(self: Sync, *args: Any) -> None:
+        begin(self, *args)
+        self._config = msgspec.structs.replace(self._config, **{name: 1 << 20})
+
+    patch.setattr(Sync, "__init__", careless)
 
 
 BUGS: dict[str, tuple[Plant, Callable[[], Scenario], str]] = {

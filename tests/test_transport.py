@@ -124,7 +124,7 @@ class TestReach:
         second, _ = station(opened, NAMES[1], free_port(), port)
         until(lambda: first.here and second.here)
         second.close()
-        until(lambda: not first.here)
+        assert until(lambda: not first.here)
         second.close()  # twice is harmless
         second.send([Outgoing(hello(NAMES[1]))])  # to nobody
 
@@ -136,7 +136,7 @@ class TestReach:
         first.close()
         until(lambda: not second.here)
         again, _ = station(opened, NAMES[0], ports[0])
-        until(lambda: second.here and again.here)
+        assert until(lambda: second.here and again.here)
 
 
 class TestTls:

@@ -434,7 +434,7 @@ class TestLive:
                     live.latest(silent)
                     return "other fleet-wide parameters" in live.remark()
 
-                until(told, "the remark")
+                assert until(told, "the remark")
 
     def test_an_endpoint_that_is_none(self) -> None:
         with pytest.raises(DagmapError, match="endpoints such as"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from random import Random
 
 import cv2
@@ -45,18 +45,18 @@ def _rig(model: str = "radial-tangential", bent: str = "0.01, 0, 0, 0", far: str
     yield b"mav0/cam1/sensor.yaml", _CAMERA.format(far, model, bent).encode()
 
 
-def seeds() -> Iterable[bytes]:
+def _pictures() -> Iterator[tuple[bytes, bytes]]:
+    """Two pairs of one view, six pixels apart."""
     noise = np.random.default_rng(1).integers(0, 256, (16, 40), np.uint8)
     wide = cv2.resize(noise, (80, 32), interpolation=cv2.INTER_LINEAR)
-    left, right = (
-        cv2.imencode(".png", np.ascontiguousarray(wide[:, at : at + 48]))[1].tobytes()
-        for at in (10, 16)
-    )
-    pictures = [(b"mav0/cam0/data/1000000000.png", left), (b"mav0/cam1/data/1000000000.png", right)]
-    pictures += [
-        (b"mav0/cam0/data/1100000000.png", left),
-        (b"mav0/cam1/data/1100000000.png", right),
-    ]
+    for stamp in (1000000000, 1100000000):
+        for i, at in enumerate((10, 16)):
+            picture = cv2.imencode(".png", np.ascontiguousarray(wide[:, at : at + 48]))[1]
+            yield f"mav0/cam{i}/data/{stamp}.png".encode(), picture.tobytes()
+
+
+def seeds() -> Iterable[bytes]:
+    pictures = list(_pictures())
     lists = [
         (
             f"mav0/cam{i}/data.csv".encode(),
@@ -102,7 +102,7 @@ def seeds() -> Iterable[bytes]:
     yield pack([*rig, *pictures, lists[0], (lists[1][0], b"x,a.png\n")])
     yield pack([*rig, *pictures, lists[0], (lists[1][0], b"9000000000,1000000000.png\n")])
     yield pack([*rig, *pictures, lists[0], (lists[1][0], b"1000000000,gone.png\n")])
-    yield pack([*rig, pictures[0], (pictures[1][0], right[:-9]), poses])
+    yield pack([*rig, pictures[0], (pictures[1][0], pictures[1][1][:-9]), poses])
     slam = (b"slam.txt", b"1.0 0 0 0 0 0 0 1\n1100000000e9 0 0 0 0 0 0 1\n")
     yield pack([*rig, *pictures, slam])
     yield pack([(b"other.txt", b"")])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -174,8 +175,15 @@ class SyncConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True
     announce_period: float = 1.0  # s between announcements of the heads
     retry_period: float = 1.0  # s after which an unanswered question is asked again
     chunk_bytes: int = 256 << 10  # an answer holds so much at most; the asker then asks on
+    # Who announces or asks is not authenticated: what is kept and looked up for them is bounded.
+    peers_remembered: int = 256  # the ones that were silent longest are forgotten
+    heads_remembered: int = 1800  # of a peer, of those that promise what is lacking here
+    ids_per_question: int = 256  # more of one question are not looked up
 
     def __post_init__(self) -> None:
+        self._require_range("peers_remembered", 1, 1 << 20)
+        self._require_range("heads_remembered", 1, 1 << 20)
+        self._require_range("ids_per_question", 1, 1024)
         self._require_range("announce_period", 0.01, 3600.0)
         self._require_range("retry_period", 0.01, 3600.0)
         self._require_range("chunk_bytes", 1 << 16, 1 << 30)
@@ -289,10 +297,7 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     @property
     def fleet_id(self) -> bytes:
         """8 bytes that name the fleet: a closed one by its key and its name."""
-        named = b"dagmap fleet 1\0" + self.fleet.encode()
-        if self.closed:
-            named = b"dagmap closed fleet 1\0" + self.fleet_public_key + self.fleet.encode()
-        return hashlib.blake2b(named, digest_size=8).digest()
+        return _fleet_id(self.fleet, self.fleet_key)
 
     @property
     def closed(self) -> bool:
@@ -310,6 +315,14 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
         graph = [self.graph.n_p, self.graph.n_c_max]
         shared = msgspec.json.encode([self.fold, self.transaction, graph])
         return hashlib.blake2b(b"dagmap parameters 1\0" + shared, digest_size=8).digest()
+
+
+@lru_cache  # every message is asked for it, several times
+def _fleet_id(fleet: str, key: str) -> bytes:
+    named = b"dagmap fleet 1\0" + fleet.encode()
+    if key:
+        named = b"dagmap closed fleet 1\0" + bytes.fromhex(key) + fleet.encode()
+    return hashlib.blake2b(named, digest_size=8).digest()
 
 
 C = TypeVar("C", bound=Config)

@@ -19,9 +19,7 @@ from .ledger import Ledger
 from .messages import MAX_ECHOES, MAX_MESSAGE, Head, Heads, Message, Transactions, Want
 from .model import AuthorId, TransactionId
 
-MAX_PEERS = 256  # senders are not authenticated here, so their number must be bounded
-_MAX_HEADS = 1800  # of one message, and of what is kept of a peer
-_MAX_IDS = 256  # of one question
+_HEADS = 1800  # that a message has room for
 _ROOM = MAX_MESSAGE - 64  # for transactions in a message
 _SMALL = 2048  # bytes for transactions in a message of a robot whose traffic is capped
 _LIVE = 5  # announcement periods without a word after which a robot counts as gone
@@ -94,7 +92,7 @@ class Sync:
         self._held()
         waiting, held = self._ledger.waiting_from(), self._ends
         for head in filterfalse(held.__contains__, message.heads):  # few are news, mostly
-            if len(peer.heads) < _MAX_HEADS and self._promises(head, waiting):
+            if len(peer.heads) < self._config.heads_remembered and self._promises(head, waiting):
                 peer.heads[head.author] = head
         for whose, token, kept in message.echoes:
             if whose == self._me and token in self._sent_at:
@@ -163,7 +161,7 @@ class Sync:
         for author in message.proofs:
             for tx in self._ledger.chain(author).proof or ():
                 yield tx.data
-        for id_ in message.ids[:_MAX_IDS]:
+        for id_ in message.ids[: self._config.ids_per_question]:
             known = self._ledger.find(id_)
             if known is not None:
                 yield known.data
@@ -174,7 +172,7 @@ class Sync:
     def _peer(self, sender: AuthorId) -> Peer:
         peer = self.peers.setdefault(sender, Peer())
         self.peers.move_to_end(sender)
-        while len(self.peers) > MAX_PEERS:
+        while len(self.peers) > self._config.peers_remembered:
             self.peers.popitem(last=False)
         return peer
 
@@ -186,8 +184,8 @@ class Sync:
             self._sent_at.popitem(last=False)
         recent = list(self.peers.items())[-MAX_ECHOES:]
         echoes = tuple((id_, p.token, max(0, round((now - p.heard) * 1e6))) for id_, p in recent)
-        for first in range(0, max(len(heads), 1), _MAX_HEADS):
-            yield Heads(self._token, echoes, tuple(heads[first : first + _MAX_HEADS])), None
+        for first in range(0, max(len(heads), 1), _HEADS):
+            yield Heads(self._token, echoes, tuple(heads[first : first + _HEADS])), None
 
     def _held(self) -> dict[AuthorId, Head]:
         """The ends of the chains as they stand here."""
@@ -224,7 +222,7 @@ class Sync:
             if wanted is not None and (before is None or now >= before.until):
                 self._asked[head.author] = Asked(*wanted, now + self._patience(peer))
                 self._asked.move_to_end(head.author)
-                if len(self._asked) > 2 * _MAX_HEADS:
+                if len(self._asked) > 2 * self._config.heads_remembered:
                     self._asked.popitem(last=False)
                 ranges.append((head.author, *wanted))
         if ranges or proofs:
@@ -265,7 +263,8 @@ class Sync:
         due = []
         for id_ in missing:
             self._asked_ids.setdefault(id_, now + self._config.retry_period / 4)
-        for id_ in sorted(self._asked_ids, key=self._asked_ids.__getitem__)[:_MAX_IDS]:
+        oldest = sorted(self._asked_ids, key=self._asked_ids.__getitem__)
+        for id_ in oldest[: self._config.ids_per_question]:
             if now >= self._asked_ids[id_]:  # longest due first: junk cannot keep others out
                 self._asked_ids[id_] = now + self._config.retry_period
                 due.append(id_)

@@ -7,6 +7,7 @@ A liar stands between its SLAM and its agent (`cycle`) and between its agent and
 from __future__ import annotations
 
 import random
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
@@ -43,7 +44,7 @@ class Honest:
         return outgoing
 
 
-class Noisy(Honest):
+class Noisy(Honest, ABC):
     """Sends bursts of messages, with a pause after each: a radio has its limit, too."""
 
     def __init__(self, seed: int) -> None:
@@ -56,9 +57,9 @@ class Noisy(Honest):
         self._rests_until = now + _PAUSE
         return outgoing + [self.noise(agent) for _ in range(_BURST)]
 
+    @abstractmethod
     def noise(self, agent: Agent) -> Outgoing:
         """One of a burst."""
-        raise NotImplementedError
 
 
 class Forger(Honest):

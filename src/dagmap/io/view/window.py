@@ -23,6 +23,7 @@ from ..closing import Closing
 from ..panels import rgb, robot_colors
 from . import words
 from .controls import Controls
+from .once import Once
 from .pace import Pace
 from .picture import Picture, Stand
 from .snapshot import Snapshot, edges_near, newest_features
@@ -43,24 +44,6 @@ _MARK, _NEWEST = (20, 20, 20), (230, 0, 180)  # colours of the picked point and 
 T = TypeVar("T")
 
 
-class _Once:
-    """Does something again only where what it depends on has changed."""
-
-    def __init__(self) -> None:
-        self._key: tuple[Any, ...] | None = None
-
-    def changed(self, *key: Any) -> bool:
-        same = self._key is not None and len(key) == len(self._key)
-        if same and all(a is b or _equal(a, b) for a, b in zip(key, self._key or (), strict=True)):
-            return False
-        self._key = key
-        return True
-
-
-def _equal(a: Any, b: Any) -> bool:
-    return bool(np.array_equal(a, b)) if isinstance(a, np.ndarray) else bool(a == b)
-
-
 @dataclass(slots=True, eq=False)
 class _Eye:
     """One browser: where its camera is, and the points that only it sees."""
@@ -68,7 +51,7 @@ class _Eye:
     client: viser.ClientHandle
     pace: Pace = field(default_factory=Pace)
     detail: viser.PointCloudHandle | None = None
-    drawn: _Once = field(default_factory=_Once)
+    drawn: Once = field(default_factory=Once)
 
     def moved(self) -> None:
         """The camera did: what a slow browser could not turn leaves at once."""
@@ -104,7 +87,7 @@ class Window(Closing):
         self._stand: Stand | None = None
         self._names: list[str] = []
         self._next_news = self._next_play = 0.0
-        self._done: dict[str, _Once] = {}
+        self._done: dict[str, Once] = {}
         self._server.on_client_connect(self._come)
         self._server.on_client_disconnect(self._leave)
         self._server.scene.on_click()(self._click)
@@ -377,7 +360,7 @@ class Window(Closing):
         )
 
     def _changed(self, what: str, *key: Any) -> bool:
-        return self._done.setdefault(what, _Once()).changed(*key)
+        return self._done.setdefault(what, Once()).changed(*key)
 
 
 def load_viser() -> Any:
