@@ -35,6 +35,7 @@ from ..io.sources import Source, open_source
 from ..io.status import StatusServer, report
 from ..io.transport import Transport, load_zenoh
 from ..model import ConfigError, DagmapError
+from .inspect import tell_notes
 from .kernels import warm_up
 
 
@@ -133,7 +134,9 @@ class AgentCommand:
             return None
         camera = None if table.camera is None else settings.at(table.camera)
         poses = None if table.poses is None else settings.at(table.poses)
-        return open_source(settings.at(table.path), table.options(camera, poses))
+        source = open_source(settings.at(table.path), table.options(camera, poses))
+        tell_notes(source, self.console)
+        return source
 
     def _assemble(
         self, settings: Settings, log: Log, stack: ExitStack

@@ -75,7 +75,7 @@ class CloudBag:
         rows = _Stamps(bag, topic, skips).rows
         self._poses: dict[int, Floats] | None = None
         if poses.known:
-            self.notes: tuple[str, ...] = (poses.check(rows[0][2]),)
+            self.notes: tuple[str, ...] = poses.notes(rows[0][2])
             self._poses = _placed(poses, rows)
             _require(bag.path, topic, len(rows), len(self._poses), poses.topic)
         else:
@@ -129,7 +129,7 @@ class RgbdBag:
         self.notes: tuple[str, ...] = ("no poses in it: odometry by OpenCV",)
         placed: dict[int, Floats] | None = None
         if poses.known:
-            self.notes = (poses.check(depths.rows[0][2]),)
+            self.notes = poses.notes(depths.rows[0][2])
             placed = _placed(poses, depths.rows)
             _require(bag.path, depth, len(depths.rows), len(placed), poses.topic)
         if bent is not None:
