@@ -27,6 +27,7 @@ class SourceConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     max_features: int = 1000  # points that a frame of pictures gives at most
     camera: str | None = None  # a camera.json to use instead of the recording's own
     poses: str | None = None  # a file of poses: TUM, or KITTI beside clouds
+    body_poses: bool = False  # poses of a SLAM are the body's (IMU), not the camera's
     max_depth: float | None = None  # m, points beyond are dropped
     topics: tuple[str, ...] = ()  # of a bag; what is not named is found by its type
     frame: str | None = None  # of a bag with tf: the frame that stands still
@@ -46,6 +47,7 @@ class SourceConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             same_frame=self.same_frame,
             voxel=self.voxel,
             keep_going=self.keep_going,
+            body_poses=self.body_poses,
         )
 
 

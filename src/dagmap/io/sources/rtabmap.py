@@ -26,7 +26,11 @@ _FEATURES = """SELECT depth_x, depth_y, depth_z FROM Feature WHERE node_id = ?
     AND depth_x IS NOT NULL ORDER BY response DESC, rowid LIMIT ?"""
 _COUNT = "SELECT count(*) FROM Feature WHERE depth_x IS NOT NULL"
 UINT8, _INT32, _FLOAT32 = 0, 4, 5  # OpenCV's types, one channel
-_TYPES = {UINT8: np.dtype("u1"), _INT32: np.dtype("<i4"), _FLOAT32: np.dtype("<f4")}
+_TYPES: dict[int, np.dtype[Any]] = {
+    UINT8: np.dtype("u1"),
+    _INT32: np.dtype("<i4"),
+    _FLOAT32: np.dtype("<f4"),
+}
 _AFTER = 1e-3  # s after the last node: when a mere correction is dated
 _MOST_SMALLER = 1100  # zlib makes nothing smaller than by this factor
 _MAGIC = b"SQLite format 3\0"
