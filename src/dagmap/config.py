@@ -161,8 +161,8 @@ class LedgerConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     # before them costs a fold of everything, which is less than undoing and applying everything.
     undo_kept: int = 1_000_000
     fold_per_tick: int = 25_000  # work of a tick, in features folded; a unit is about 1 us
-    # s from when all is folded until ticks fold again; 0: in every tick. Where much comes late, over
-    # many hops or bad links, every fold undoes and repeats some of the last one: seldom costs less.
+    # s from when all is folded until ticks fold again; 0: every tick folds. Where much comes late,
+    # as over many hops, each fold undoes and repeats some of the last one: seldom costs less.
     fold_period: float = 0.0
 
     def __post_init__(self) -> None:
