@@ -366,10 +366,9 @@ class Agent:
 
     def _fold_on(self, now: float) -> list[Event]:
         """A tick's share of folding, where it is time for any."""
-        if now < self._next_fold or self.settled:
-            return []
-        events = self._advance(self.config.ledger.fold_per_tick)
-        if self.settled:
+        due = now >= self._next_fold and self.consensus.pending
+        events = self._advance(self.config.ledger.fold_per_tick) if due else []
+        if due and self.settled:
             self._next_fold = now + self.config.ledger.fold_period
         return events
 
