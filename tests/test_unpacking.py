@@ -136,6 +136,11 @@ def test_chunks_of_ros_1_are_bounded_too() -> None:
         assert reader.decompressors[kind](pack(b"walk")) == b"walk"
         with pytest.raises(Swollen, match="becomes more than the"):
             reader.decompressors[kind](pack(bytes(MOST + 1)))
+        for size in (4, 5):
+            assert reader.decompressors[kind](pack(b"walk"), size) == b"walk"
+        for end in (1, 4):
+            with pytest.raises(ValueError, match="cut short"):
+                reader.decompressors[kind](pack(bytes(100_000))[:-end])
     with pytest.raises(Swollen, match="than the 3 bytes"):
         unpack_bz2(bz2.compress(b"walk"), 3)
     with pytest.raises(Swollen, match=f"claims {MOST + 1} bytes"):

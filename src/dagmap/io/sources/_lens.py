@@ -16,6 +16,8 @@ _PERSPECTIVE = ("plumb_bob", "rational_polynomial")
 _FISHEYE = ("equidistant", "fisheye")
 _COUNTS = (4, 5, 8, 12, 14)  # coefficients that OpenCV takes of the perspective models
 _STEPS, _CLOSE = 50, 1e-9  # of the iteration that straightens, normalised units
+_WIDEST = 10.0  # x or y by z, 84 degrees: what lies further aside has no depth to speak of
+_LARGEST = 1e6  # pixels: no camera has more
 _OFF = 0.1  # pixels: what does not bend back to its place has no ray
 _DEPTH_UNITS = 1000.0  # a metre, by REP 118
 # A part of a topic's name that begins so: image_rect_color, rgb/rect/image; but not direct.
@@ -51,6 +53,7 @@ class Distortion:
             bent, _ = cv2.projectPoints(rays, none, none, k, self.coefficients)
         with np.errstate(invalid="ignore", over="ignore"):
             good = np.hypot(*(bent[:, 0] - places).T) <= _OFF
+            good &= (np.abs(flat[:, 0]) <= _WIDEST).all(axis=1)
             out = flat[:, 0] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
         return np.where(good[:, None], out, np.nan)
 
@@ -72,7 +75,8 @@ def lens_of(info: Any, rectified: bool) -> tuple[Camera, Distortion | None]:
     pinhole = k[[0, 4, 2, 5]] if len(k) == 9 else np.zeros(4)
     if flat and len(p) == 12 and p.any():
         pinhole = p[[0, 5, 2, 6]]
-    if not np.isfinite(pinhole).all() or not (pinhole[:2] > 0).all() or not width * height:
+    usable = (np.abs(pinhole) < _LARGEST).all() and (pinhole[:2] > 0).all()
+    if not usable or not width * height:
         raise Unusable(
             f"the camera is not calibrated (K = {k.tolist()}, P = {p.tolist()}); calibrate it, or "
             "name a camera.json with --camera"

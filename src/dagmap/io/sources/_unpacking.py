@@ -24,14 +24,20 @@ def unpack_zstd(data: bytes, size: int = MOST) -> bytes:
 
 
 def unpack_lz4(data: bytes, size: int = MOST) -> bytes:
-    """See `unpack_zstd`; of several frames the first. Raises RuntimeError for damaged bytes."""
+    """See `unpack_zstd`; of several frames the first.
+
+    Raises RuntimeError or ValueError for damaged bytes.
+    """
     unpacker = import_module("lz4.frame").LZ4FrameDecompressor()
-    return _bounded(bytes(unpacker.decompress(data, max_length=_allowed(size) + 1)), size)
+    raw = _bounded(bytes(unpacker.decompress(data, max_length=_allowed(size) + 1)), size)
+    return _whole(raw, unpacker.eof)
 
 
 def unpack_bz2(data: bytes, size: int = MOST) -> bytes:
-    """See `unpack_lz4`. Raises OSError for damaged bytes."""
-    return _bounded(bz2.BZ2Decompressor().decompress(data, _allowed(size) + 1), size)
+    """See `unpack_lz4`. Raises OSError or ValueError for damaged bytes."""
+    unpacker = bz2.BZ2Decompressor()
+    raw = _bounded(unpacker.decompress(data, _allowed(size) + 1), size)
+    return _whole(raw, unpacker.eof)
 
 
 def bound_rosbags() -> None:
@@ -58,6 +64,12 @@ def _allowed(size: int) -> int:
             f"a packed chunk claims {size} bytes, more than the {MOST} that are unpacked at once"
         )
     return size
+
+
+def _whole(raw: bytes, ended: bool) -> bytes:
+    if not ended:
+        raise ValueError("a packed chunk is cut short")
+    return raw
 
 
 def _bounded(raw: bytes, size: int) -> bytes:
