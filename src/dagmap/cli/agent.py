@@ -178,11 +178,12 @@ def _inbox(config: AgentConfig) -> Inbox:
     """What comes in, within the configuration's limits."""
     network = config.network
     rates = Rates(
-        network.receive_messages_per_second,
-        network.receive_messages_per_second_per_robot,
-        network.receive_bytes_per_second_per_robot,
-        config.sync.chunk_bytes,
-        network.senders_remembered,
+        messages=network.receive_messages_per_second,
+        bytes=network.receive_bytes_per_second,
+        messages_of_one=network.receive_messages_per_second_per_robot,
+        bytes_of_one=network.receive_bytes_per_second_per_robot,
+        question=config.sync.chunk_bytes,
+        senders=network.senders_remembered,
     )
     most, of_one = network.receive_bytes, network.receive_bytes_per_robot
     return Inbox(most, of_one, rates, at_once=network.messages_per_step)
