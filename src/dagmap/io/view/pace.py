@@ -10,6 +10,8 @@ SLOW = 0.15  # s between two frames: from here on a movement is jerky
 _FAST = 0.04
 _PAUSE = 5.0  # s: not one movement any more
 _PROOF = 15  # fast frames in a row
+_UNKNOWN = 0.4  # s that a frame takes until it is known
+_FADE = 0.7  # a frame later a slow one counts so much
 _CHANCES = 2  # times that a browser may prove itself
 
 
@@ -19,7 +21,7 @@ class Pace:
     def __init__(self) -> None:
         self.slow = True
         self._last: float | None = None
-        self._gap = 0.0  # s between its last two frames
+        self._gap = _UNKNOWN  # s between its last frames, slow ones above all
         self._slow_frames = self._fast_frames = self._proofs = 0
 
     def moved(self, now: float) -> None:
@@ -28,7 +30,7 @@ class Pace:
         self._last = now
         if gap >= _PAUSE:
             return
-        self._gap = gap
+        self._gap = max(gap, _FADE * self._gap)
         self._slow_frames = self._slow_frames + 1 if gap > SLOW else 0
         self._fast_frames = self._fast_frames + 1 if gap < _FAST else 0
         if self.slow and self._fast_frames >= _PROOF and self._proofs < _CHANCES:
@@ -38,5 +40,8 @@ class Pace:
             self.slow = True
 
     def rests(self, now: float, seconds: float) -> bool:
-        """Whether there was no movement for so long; of a slow browser, for three frames too."""
+        """Whether there was no movement for so long; of a slow browser, for three frames too.
+
+        A browser that is at work on one slow frame cannot say that it moves.
+        """
         return self._last is None or now - self._last >= max(seconds, 3 * self._gap)

@@ -6,6 +6,7 @@ Callbacks of viser only note what is wanted; one thread, that of `run`, reads it
 from __future__ import annotations
 
 import io
+import math
 import socket
 import threading
 import time
@@ -38,6 +39,8 @@ _RESTING = 100_000  # that it can draw when nothing moves, about the place it lo
 _EDGES = 20_000
 _TICK = 0.05  # s between two looks at what is wanted
 _REST = 0.3  # s without a movement of the camera, after which its surroundings are drawn
+_ARRIVAL = 2.0  # s that a browser has for the first picture, before the ledger is read
+_PATIENCE = 20.0  # s until it is read though no browser has come
 _NEWS = 1.0  # s between two questions to a running fleet, or thrice what an answer takes
 _PLAY = 0.2  # s between two steps of the ledger while it plays
 _MARK, _NEWEST = (20, 20, 20), (230, 0, 180)  # colours of the picked point and of what is new
@@ -49,6 +52,7 @@ class _Eye:
     """One browser: where its camera is, and the points that only it sees."""
 
     client: viser.ClientHandle
+    came: float  # s
     pace: Pace = field(default_factory=Pace)
     detail: viser.PointCloudHandle | None = None
     drawn: Once = field(default_factory=Once)
@@ -72,6 +76,7 @@ class Window(Closing):
         with redirect_stdout(io.StringIO()):  # viser greets
             self._server: viser.ViserServer = module.ViserServer(host, port, verbose=False)
         self._host, self._source = host, source
+        self._light()
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
         self._server.gui.set_panel_label("DAGmap")
         self.controls = Controls(self._server.gui, points)
@@ -87,6 +92,7 @@ class Window(Closing):
         self._stand: Stand | None = None
         self._names: list[str] = []
         self._next_news = self._next_play = 0.0
+        self._begun = -math.inf  # s, when the first picture was there
         self._done: dict[str, Once] = {}
         self._server.on_client_connect(self._come)
         self._server.on_client_disconnect(self._leave)
@@ -103,6 +109,7 @@ class Window(Closing):
         first = self._source.first()
         if first is not None:
             self._show(first)
+            self._begun = time.monotonic()
         while not self._stopped.wait(_TICK):
             self.step()
 
@@ -123,10 +130,19 @@ class Window(Closing):
         if self._shown is not None:
             self._draw(self._shown)
 
+    def _light(self) -> None:
+        """Colours as the legend has them. Shadows and reflections cost a browser without a graphics
+        card more in every frame than the points do."""
+        scene = self._server.scene
+        scene.configure_default_lights(enabled=False, cast_shadow=False)
+        scene.configure_environment_map(hdri=None)
+        scene.add_light_ambient("/light", intensity=math.pi)  # of which a surface returns 1 / pi
+
     # What the browser says, in threads of viser's.
 
     def _come(self, client: viser.ClientHandle) -> None:
-        eye = _Eye(client)
+        eye = _Eye(client, time.monotonic())
+        eye.moved()  # what is near comes once it has drawn what is everywhere
         with self._lock:
             self._eyes[client.client_id] = eye
 
@@ -144,7 +160,10 @@ class Window(Closing):
     def _listen(self) -> None:
         """Take what is new."""
         now = time.monotonic()
-        if self._latest is not None and (not self._source.live or now < self._next_news):
+        if self._latest is None:
+            if self._is_early(now):
+                return
+        elif not self._source.live or now < self._next_news:
             return
         latest = self._working(self._source.latest)
         self._next_news = time.monotonic() + max(_NEWS, 3 * (time.monotonic() - now))
@@ -158,6 +177,12 @@ class Window(Closing):
             self._latest = latest
             if self.controls.latest.value:
                 self._show(latest)
+
+    def _is_early(self, now: float) -> bool:
+        """Whether a browser has yet to get what can be shown at once: folding would hold that up."""
+        with self._lock:
+            came = [eye.came for eye in self._eyes.values()]
+        return now < (min(came) + _ARRIVAL if came else self._begun + _PATIENCE)
 
     def _walk(self) -> None:
         """Go to the transaction at which the slider stands."""
