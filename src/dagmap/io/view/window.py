@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import redirect_stdout
-from dataclasses import dataclass, field
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -24,8 +23,9 @@ from ..closing import Closing
 from ..panels import rgb, robot_colors
 from . import words
 from .controls import Controls
+from .eye import Eye
 from .once import Once
-from .pace import Pace
+from .pace import Headstart
 from .picture import Picture, Stand
 from .snapshot import Snapshot, edges_near, newest_features
 from .source import Source
@@ -39,29 +39,10 @@ _RESTING = 100_000  # that it can draw when nothing moves, about the place it lo
 _EDGES = 20_000
 _TICK = 0.05  # s between two looks at what is wanted
 _REST = 0.3  # s without a movement of the camera, after which its surroundings are drawn
-_ARRIVAL = 2.0  # s that a browser has for the first picture, before the ledger is read
-_PATIENCE = 20.0  # s until it is read though no browser has come
 _NEWS = 1.0  # s between two questions to a running fleet, or thrice what an answer takes
 _PLAY = 0.2  # s between two steps of the ledger while it plays
 _MARK, _NEWEST = (20, 20, 20), (230, 0, 180)  # colours of the picked point and of what is new
 T = TypeVar("T")
-
-
-@dataclass(slots=True, eq=False)
-class _Eye:
-    """One browser: where its camera is, and the points that only it sees."""
-
-    client: viser.ClientHandle
-    came: float  # s
-    pace: Pace = field(default_factory=Pace)
-    detail: viser.PointCloudHandle | None = None
-    drawn: Once = field(default_factory=Once)
-
-    def moved(self) -> None:
-        """The camera did: what a slow browser could not turn leaves at once."""
-        self.pace.moved(time.monotonic())
-        if self.pace.slow and self.detail is not None:
-            self.detail.visible = False
 
 
 class Window(Closing):
@@ -82,7 +63,7 @@ class Window(Closing):
         self.controls = Controls(self._server.gui, points)
         self._stopped = threading.Event()
         self._lock = threading.Lock()
-        self._eyes: dict[int, _Eye] = {}
+        self._eyes: dict[int, Eye] = {}
         self._ray: tuple[Floats, Floats] | None = None  # a click that nobody has looked at yet
         self._picked: Floats | None = None  # (3,) m
         self._looked_at = np.zeros(3)
@@ -92,7 +73,7 @@ class Window(Closing):
         self._stand: Stand | None = None
         self._names: list[str] = []
         self._next_news = self._next_play = 0.0
-        self._begun = -math.inf  # s, when the first picture was there
+        self._headstart = Headstart()
         self._done: dict[str, Once] = {}
         self._server.on_client_connect(self._come)
         self._server.on_client_disconnect(self._leave)
@@ -109,7 +90,7 @@ class Window(Closing):
         first = self._source.first()
         if first is not None:
             self._show(first)
-            self._begun = time.monotonic()
+            self._headstart.shown(time.monotonic())
         while not self._stopped.wait(_TICK):
             self.step()
 
@@ -141,7 +122,8 @@ class Window(Closing):
     # What the browser says, in threads of viser's.
 
     def _come(self, client: viser.ClientHandle) -> None:
-        eye = _Eye(client, time.monotonic())
+        self._headstart.came(time.monotonic())
+        eye = Eye(client)
         eye.moved()  # what is near comes once it has drawn what is everywhere
         with self._lock:
             self._eyes[client.client_id] = eye
@@ -161,7 +143,7 @@ class Window(Closing):
         """Take what is new."""
         now = time.monotonic()
         if self._latest is None:
-            if self._is_early(now):
+            if not self._headstart.is_over(now):
                 return
         elif not self._source.live or now < self._next_news:
             return
@@ -177,12 +159,6 @@ class Window(Closing):
             self._latest = latest
             if self.controls.latest.value:
                 self._show(latest)
-
-    def _is_early(self, now: float) -> bool:
-        """Whether a browser has yet to get what can be shown at once: folding would hold that up."""
-        with self._lock:
-            came = [eye.came for eye in self._eyes.values()]
-        return now < (min(came) + _ARRIVAL if came else self._begun + _PATIENCE)
 
     def _walk(self) -> None:
         """Go to the transaction at which the slider stands."""
