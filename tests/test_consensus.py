@@ -77,6 +77,23 @@ def test_a_tick_folds_a_bounded_share_and_a_read_the_rest() -> None:
     assert taker.consensus.pending and taker.digest() == giver.digest()
 
 
+def test_a_robot_that_folds_seldom_does_what_came_at_once() -> None:
+    seldom = msgspec.structs.replace(QUICK, ledger=LedgerConfig(fold_period=10.0))
+    giver, taker = agent("giver"), agent("taker", seldom)
+    for cycle in cycles(1, count=10, churn=False):
+        giver.observe(cycle, cycle.stamp)
+    first, *rest = giver.ledger
+    folded = []
+    for now, found in ((0.0, [first]), (4.0, rest[::2]), (8.0, rest[1::2]), (10.0, [])):
+        for tx in found:
+            taker.receive(encode(Transactions((tx.data,)), seldom, b"somebody"), now)
+        changes = [e for e in taker.tick(now) if isinstance(e, MapChanged)]
+        folded.append([(e.undone, e.applied) for e in changes])
+        assert taker.settled is (now in (0.0, 10.0))
+    assert folded == [[(0, 1)], [], [], [(0, len(rest))]]
+    assert taker.digest() == giver.digest()
+
+
 def shown(author: Author, sessions: int) -> None:
     """Something was seen in so many SLAM frames of an author."""
     for session in range(sessions):

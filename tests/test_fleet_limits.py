@@ -48,19 +48,16 @@ def watch(robots: tuple[Robot, ...], authors: int) -> dict[str, list[tuple[float
     return told
 
 
-@pytest.mark.parametrize("capped", [True, False])
-def test_a_robots_cap_holds_and_all_arrives(
-    nursery: Nursery, tmp_path: Path, walk: Path, capped: bool
-) -> None:
-    limit = f"[overhead]\nrobot_bytes_per_second = {CAP}\n" if capped else ""
+def test_a_robots_cap_holds_and_all_arrives(nursery: Nursery, tmp_path: Path, walk: Path) -> None:
+    limit = f"[overhead]\nrobot_bytes_per_second = {CAP}\n"
     a = Robot(nursery, tmp_path, "a", walk, more=limit)
     b = Robot(nursery, tmp_path, "b", None, (a.port,))
     with running(a, b):
         b.start()
         a.start("--speed", 30, "--wait-for", 1)
         told = watch((a, b), authors=1)["a"]
-        assert told[-1][1] > 8 * CAP  # there was more to say than the cap lets through at once
-        assert (busiest(told) <= 1.05 * CAP) is capped
+        assert told[-1][1] > 7 * CAP  # it had more to say in its two seconds of recording
+        assert busiest(told) <= 1.05 * CAP
         assert [a.stop(), b.stop()] == [0, 0]
     assert a.ids() == b.ids()
 

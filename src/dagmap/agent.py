@@ -6,6 +6,7 @@ socket, disk, chance or log in here or below.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -81,6 +82,7 @@ class Agent:
         self._map: WorldMap | None = None
         self._map_version = -1  # of the consensus, when the map was made
         self._undone = self._applied = 0  # transactions, since the last `MapChanged`
+        self._next_fold = -math.inf
 
     @classmethod
     def restore(
@@ -165,7 +167,7 @@ class Agent:
         self.steering.look(self.sync, now)
         events = self.steering.catch_up(self.observing, now, self._settled)
         events += self._issue(now)
-        events += self._advance(self.config.ledger.fold_per_tick)
+        events += self._fold_on(now)
         self.observing.relate(*self.placing.step(self.ledger, self.consensus))
         self.steering.announce(self.sync.tick(now, unread), now)
         self.steering.shaper.release(now)
@@ -361,6 +363,14 @@ class Agent:
             if tx not in self.consensus and self.ledger.counts(tx):
                 tx.payload = tx.decode_again(self.config)
                 self.consensus.add(tx)
+
+    def _fold_on(self, now: float) -> list[Event]:
+        """A tick's share of folding, where it is time for any."""
+        due = now >= self._next_fold and self.consensus.pending
+        events = self._advance(self.config.ledger.fold_per_tick) if due else []
+        if due and self.settled:
+            self._next_fold = now + self.config.ledger.fold_period
+        return events
 
     def _advance(self, budget: int | None = None) -> list[Event]:
         """Fold on. What a revision does is told of at its end, as one change."""

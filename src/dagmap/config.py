@@ -161,12 +161,16 @@ class LedgerConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     # before them costs a fold of everything, which is less than undoing and applying everything.
     undo_kept: int = 1_000_000
     fold_per_tick: int = 25_000  # work of a tick, in features folded; a unit is about 1 us
+    # s from when all is folded until ticks fold again; 0: every tick folds. Where much comes late,
+    # as over many hops, each fold undoes and repeats some of the last one: seldom costs less.
+    fold_period: float = 0.0
 
     def __post_init__(self) -> None:
         self._require_range("waiting_transactions", 1, 1 << 24)
         self._require_range("waiting_bytes", 1 << 16, 1 << 40)
         self._require_range("undo_kept", 0, 1 << 40)
         self._require_range("fold_per_tick", 1, 1 << 40)
+        self._require_range("fold_period", 0.0, 3600.0)
 
 
 class SyncConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
