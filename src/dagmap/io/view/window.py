@@ -112,7 +112,7 @@ class Window(Closing):
             self._draw(self._shown)
 
     def _light(self) -> None:
-        """Colours as the legend has them; no work for shadows and reflections, which points lack."""
+        """Colours as the legend has them; no work for shadows, which points do not cast."""
         scene = self._server.scene
         scene.configure_default_lights(enabled=False, cast_shadow=False)
         scene.configure_environment_map(hdri=None)
