@@ -19,7 +19,7 @@ from dagmap.io.view import words
 from dagmap.io.view.colouring import COLOURINGS, legend, owners_of, paint
 from dagmap.io.view.history import MARKS, History, silent
 from dagmap.io.view.live import LiveFleet, standings
-from dagmap.io.view.pace import Pace
+from dagmap.io.view.pace import ARRIVAL, PATIENCE, Headstart, Pace
 from dagmap.io.view.picking import pick, reason, sightings
 from dagmap.io.view.picture import Picture, Stand
 from dagmap.io.view.run import Run
@@ -281,6 +281,20 @@ class TestPace:
             pace.moved(1.0 * i)
         assert not pace.rests(4.9, 0.3) and pace.rests(5.0, 0.3)
 
+    def test_nor_is_the_first_one_of_a_browser_that_nobody_knows(self) -> None:
+        pace = Pace()
+        pace.moved(0.0)
+        assert not pace.rests(1.1, 0.3) and pace.rests(1.3, 0.3)
+        for i in range(30):
+            pace.moved(2.0 + 0.02 * i)
+        assert pace.rests(2.58 + 0.31, 0.3)  # it is known to be fast
+
+    def test_one_fast_frame_among_slow_ones_is_no_rest_either(self) -> None:
+        pace = Pace()
+        for now in (0.0, 1.0, 2.0, 2.01):
+            pace.moved(now)
+        assert not pace.rests(4.0, 0.3) and pace.rests(4.2, 0.3)
+
     def test_pauses_are_no_slowness(self) -> None:
         pace = Pace()
         assert pace.rests(0.0, 1.0)
@@ -290,6 +304,33 @@ class TestPace:
             pace.moved(10.0 * i + 10)
         assert not pace.slow
         assert pace.rests(201.5, 1.0) and not pace.rests(200.5, 1.0)
+
+
+class TestHeadstart:
+    def test_without_a_picture_the_ledger_comes_first(self) -> None:
+        headstart = Headstart()
+        assert headstart.is_over(0.0)
+        headstart.came(0.0)
+        assert headstart.is_over(0.0)
+
+    def test_the_first_browser_gets_its_picture_first(self) -> None:
+        headstart = Headstart()
+        headstart.shown(10.0)
+        assert not headstart.is_over(10.0 + ARRIVAL)
+        headstart.came(14.0)
+        headstart.came(15.0)  # who comes later does not delay it
+        assert not headstart.is_over(13.9 + ARRIVAL) and headstart.is_over(14.0 + ARRIVAL)
+
+    def test_a_browser_that_is_there_before_the_picture(self) -> None:
+        headstart = Headstart()
+        headstart.came(1.0)
+        headstart.shown(10.0)
+        assert not headstart.is_over(9.9 + ARRIVAL) and headstart.is_over(10.0 + ARRIVAL)
+
+    def test_nobody_comes(self) -> None:
+        headstart = Headstart()
+        headstart.shown(10.0)
+        assert not headstart.is_over(9.9 + PATIENCE) and headstart.is_over(10.0 + PATIENCE)
 
 
 class TestRun:

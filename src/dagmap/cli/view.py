@@ -9,7 +9,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from ..io.view.live import LiveFleet
 from ..io.view.run import Run
 from ..io.view.source import Source
 from ..io.view.window import Window, load_viser
@@ -61,4 +60,6 @@ class ViewCommand:
         if self.robot is not None:
             raise DagmapError("--robot goes with a run's folder; the live view has its own ledger")
         assert self.live is not None
+        from ..io.view.live import LiveFleet  # a folder's view need not wait for the network's code
+
         return LiveFleet(self.live, self.config)

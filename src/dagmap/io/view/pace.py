@@ -10,6 +10,10 @@ SLOW = 0.15  # s between two frames: from here on a movement is jerky
 _FAST = 0.04
 _PAUSE = 5.0  # s: not one movement any more
 _PROOF = 15  # fast frames in a row
+_UNKNOWN = 0.4  # s that a frame takes until it is known
+_FADE = 0.7  # a frame later a slow one counts so much
+ARRIVAL = 2.0  # s that a browser has for the first picture before the ledger is read
+PATIENCE = 20.0  # s until it is read though no browser has come
 _CHANCES = 2  # times that a browser may prove itself
 
 
@@ -19,7 +23,7 @@ class Pace:
     def __init__(self) -> None:
         self.slow = True
         self._last: float | None = None
-        self._gap = 0.0  # s between its last two frames
+        self._gap = _UNKNOWN  # s between its last frames, slow ones above all
         self._slow_frames = self._fast_frames = self._proofs = 0
 
     def moved(self, now: float) -> None:
@@ -28,7 +32,7 @@ class Pace:
         self._last = now
         if gap >= _PAUSE:
             return
-        self._gap = gap
+        self._gap = max(gap, _FADE * self._gap)
         self._slow_frames = self._slow_frames + 1 if gap > SLOW else 0
         self._fast_frames = self._fast_frames + 1 if gap < _FAST else 0
         if self.slow and self._fast_frames >= _PROOF and self._proofs < _CHANCES:
@@ -38,5 +42,33 @@ class Pace:
             self.slow = True
 
     def rests(self, now: float, seconds: float) -> bool:
-        """Whether there was no movement for so long; of a slow browser, for three frames too."""
+        """Whether there was no movement for so long; of a slow browser, for three frames too.
+
+        A browser that is at work on one slow frame cannot say that it moves.
+        """
         return self._last is None or now - self._last >= max(seconds, 3 * self._gap)
+
+
+class Headstart:
+    """What a first picture gets before the ledger is read, which would hold up the browsers: both
+    want the interpreter, and maybe the same processor. Times are seconds on any steady clock."""
+
+    def __init__(self) -> None:
+        self._shown: float | None = None
+        self._came: float | None = None
+
+    def shown(self, now: float) -> None:
+        """There is a picture."""
+        self._shown = now
+
+    def came(self, now: float) -> None:
+        """A browser did."""
+        self._came = now if self._came is None else self._came
+
+    def is_over(self, now: float) -> bool:
+        """Whether the ledger may be read. Where there is no picture before, at once."""
+        if self._shown is None:
+            return True
+        if self._came is None:
+            return now >= self._shown + PATIENCE
+        return now >= max(self._shown, self._came) + ARRIVAL

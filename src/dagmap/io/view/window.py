@@ -6,12 +6,12 @@ Callbacks of viser only note what is wanted; one thread, that of `run`, reads it
 from __future__ import annotations
 
 import io
+import math
 import socket
 import threading
 import time
 from collections.abc import Callable
 from contextlib import redirect_stdout
-from dataclasses import dataclass, field
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -23,8 +23,9 @@ from ..closing import Closing
 from ..panels import rgb, robot_colors
 from . import words
 from .controls import Controls
+from .eye import Eye
 from .once import Once
-from .pace import Pace
+from .pace import Headstart
 from .picture import Picture, Stand
 from .snapshot import Snapshot, edges_near, newest_features
 from .source import Source
@@ -44,22 +45,6 @@ _MARK, _NEWEST = (20, 20, 20), (230, 0, 180)  # colours of the picked point and 
 T = TypeVar("T")
 
 
-@dataclass(slots=True, eq=False)
-class _Eye:
-    """One browser: where its camera is, and the points that only it sees."""
-
-    client: viser.ClientHandle
-    pace: Pace = field(default_factory=Pace)
-    detail: viser.PointCloudHandle | None = None
-    drawn: Once = field(default_factory=Once)
-
-    def moved(self) -> None:
-        """The camera did: what a slow browser could not turn leaves at once."""
-        self.pace.moved(time.monotonic())
-        if self.pace.slow and self.detail is not None:
-            self.detail.visible = False
-
-
 class Window(Closing):
     """Serves the view of a source. `run` draws until `stop`, or until somebody presses Ctrl-C.
 
@@ -72,12 +57,13 @@ class Window(Closing):
         with redirect_stdout(io.StringIO()):  # viser greets
             self._server: viser.ViserServer = module.ViserServer(host, port, verbose=False)
         self._host, self._source = host, source
+        self._light()
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
         self._server.gui.set_panel_label("DAGmap")
         self.controls = Controls(self._server.gui, points)
         self._stopped = threading.Event()
         self._lock = threading.Lock()
-        self._eyes: dict[int, _Eye] = {}
+        self._eyes: dict[int, Eye] = {}
         self._ray: tuple[Floats, Floats] | None = None  # a click that nobody has looked at yet
         self._picked: Floats | None = None  # (3,) m
         self._looked_at = np.zeros(3)
@@ -87,6 +73,7 @@ class Window(Closing):
         self._stand: Stand | None = None
         self._names: list[str] = []
         self._next_news = self._next_play = 0.0
+        self._headstart = Headstart()
         self._done: dict[str, Once] = {}
         self._server.on_client_connect(self._come)
         self._server.on_client_disconnect(self._leave)
@@ -103,6 +90,7 @@ class Window(Closing):
         first = self._source.first()
         if first is not None:
             self._show(first)
+            self._headstart.shown(time.monotonic())
         while not self._stopped.wait(_TICK):
             self.step()
 
@@ -123,10 +111,19 @@ class Window(Closing):
         if self._shown is not None:
             self._draw(self._shown)
 
+    def _light(self) -> None:
+        """Colours as the legend has them; no work for shadows, which points do not cast."""
+        scene = self._server.scene
+        scene.configure_default_lights(enabled=False, cast_shadow=False)
+        scene.configure_environment_map(hdri=None)
+        scene.add_light_ambient("/light", intensity=math.pi)  # of which a surface returns 1 / pi
+
     # What the browser says, in threads of viser's.
 
     def _come(self, client: viser.ClientHandle) -> None:
-        eye = _Eye(client)
+        self._headstart.came(time.monotonic())
+        eye = Eye(client)
+        eye.moved()  # what is near comes once it has drawn what is everywhere
         with self._lock:
             self._eyes[client.client_id] = eye
 
@@ -144,7 +141,10 @@ class Window(Closing):
     def _listen(self) -> None:
         """Take what is new."""
         now = time.monotonic()
-        if self._latest is not None and (not self._source.live or now < self._next_news):
+        if self._latest is None:
+            if not self._headstart.is_over(now):
+                return
+        elif not self._source.live or now < self._next_news:
             return
         latest = self._working(self._source.latest)
         self._next_news = time.monotonic() + max(_NEWS, 3 * (time.monotonic() - now))
