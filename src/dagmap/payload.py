@@ -27,6 +27,7 @@ from .model import (
     Reason,
     Uint8s,
 )
+from .text import printable
 from .wire import Reader, Refusal
 
 MAX_FEATURES = 4096  # of one bundle record; bounds the work that foreign bytes can ask for
@@ -234,8 +235,8 @@ def _decode_name(body: Reader) -> str:
         name = body.take(body.left).decode()
     except UnicodeDecodeError:
         raise Refusal(Reason.MALFORMED, "name is not UTF-8") from None
-    if not name.isprintable():
-        raise Refusal(Reason.MALFORMED, "name has unprintable characters")
+    if not printable(name):
+        raise Refusal(Reason.MALFORMED, "name has characters that none may have")
     return name
 
 

@@ -34,6 +34,7 @@ from ..config import Config, load_config
 from ..identity import Identity, author_of, certificate_holds
 from ..model import MAX_NAME, AuthorId, ConfigError, KeysError
 from ..payload import MAX_SEQUENCE, Payload, Revocation
+from ..text import printable
 from ..transaction import Transaction, parse, seal
 from ..wire import Refusal
 from .certificates import make_authority, make_leaf, valid_until
@@ -187,7 +188,7 @@ class Fleet:
 
 def create_fleet(folder: Path, name: str) -> Fleet:
     """Make a fleet's key and folder. Raises KeysError where the folder holds something."""
-    if not 0 < len(name.encode()) <= MAX_NAME or not name.isprintable():
+    if not 0 < len(name.encode()) <= MAX_NAME or not printable(name):
         raise KeysError(f"--name {name!r}: 1 to {MAX_NAME} bytes of printable text are wanted")
     key = Ed25519PrivateKey.generate()
     public_key = key.public_key().public_bytes_raw().hex()
