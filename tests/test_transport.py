@@ -257,6 +257,7 @@ class Authority:
                 serialization.NoEncryption(),
             )
         )
+        paths["key"].chmod(0o600)
         return TlsConfig(
             ca=str(self.folder / "ca.pem"), certificate=str(paths["pem"]), key=str(paths["key"])
         )
