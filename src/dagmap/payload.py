@@ -36,7 +36,7 @@ MAX_SEQUENCE = (1 << 40) - 1  # of an author's transactions
 CERTAIN = (1 << 31) - 1  # inliers of a link that was configured, not measured
 _MAX_LIST = 1 << 16
 _DESCRIBED = np.dtype([("position", "<i4", 3), ("descriptor", "u1", DESCRIPTOR)])
-_NORM_SLACK = 1 << 50  # of a quaternion's squared norm 2^60: a thousandth
+_NORM_SLACK = 1 << 50  # of a quaternion's squared norm 2^60: a 1024th
 
 
 class Kind(IntEnum):

@@ -54,7 +54,8 @@ def _doubts(
     """chain: the robot's certificate, and what is between it and the authority."""
     own = chain[0]
     names = own.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
-    remedy = f"renew it with: dagmap keys renew {names[0].value if names else 'NAME'}"
+    name = next((entry.value for entry in names if isinstance(entry.value, str)), "NAME")
+    remedy = f"renew it with: dagmap keys renew {name}"
     if now > own.not_valid_after_utc:
         yield f"it expired {own.not_valid_after_utc:%Y-%m-%d}, if the clock is right; {remedy}"
     if now < own.not_valid_before_utc:
