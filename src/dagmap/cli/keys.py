@@ -101,8 +101,8 @@ def revoke(
     before = int(path.stem)
     done = f"{path}: {name} counts up to number {last}; give this file to any robot of the fleet"
     first = (
-        f"{fleet} held {before} revocations before. First see that `dagmap status` of a robot shows "
-        f"no more transactions of the fleet key ({author}): where it does, {fleet} is an old copy; "
+        f"{fleet} held {before} revocations before. First see that `dagmap status` of a robot "
+        f"shows no more transactions of the fleet key ({author}): where it does, {fleet} is an old copy; "
         f"then put back the newest, and remove {path}: it would end the fleet key's say for good"
     )
     facts = {"file": str(path), "name": name, "last": last, "number": before, "author": author}
