@@ -117,7 +117,7 @@ $(DEMO)/bin/python $(TEST)/bin/python $(LOCK)/bin/python:
 	  $(PYTHON) -m pip --python $@ -qq install pip; fi
 
 lock: $(LOCK)/bin/uv
-	$(COMPILE) --extra fleet --extra rgbd --extra report --extra view \
+	$(COMPILE) --extra fleet --extra rgbd --extra report --extra view --extra ros \
 	  --output-file requirements/demo.txt
 	$(COMPILE) --extra dev --constraint requirements/demo.txt --output-file requirements/test.txt
 	$(COMPILE) --extra fuzz --constraint requirements/test.txt --output-file requirements/fuzz.txt

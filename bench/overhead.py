@@ -19,6 +19,7 @@ import numpy as np
 from dagmap import Agent, Config, Cycle, GraphConfig, Identity
 from dagmap.config import IssuanceConfig, OverheadConfig
 from dagmap.equations import Model, Size, Work
+from dagmap.model import DagmapError
 from dagmap.steering import Steering
 from scenes import surface
 
@@ -184,15 +185,27 @@ def measure(most: int, further: Sequence[int] = ()) -> dict[str, list[Row]]:
 
 
 def run(most: int | None = None) -> list[Row]:
-    """Rows. n(U) goes up to 10^6, or to DAGMAP_BENCH_MOST (10^7 takes minutes and 3 GB)."""
-    most = most or int(os.environ.get("DAGMAP_BENCH_MOST", "1000000"))
-    found = measure(most)
+    """Rows. n(U) is measured up to 10^6, or to DAGMAP_BENCH_MOST (10^7 takes minutes and 3 GB), and
+    predicted up to 10^7."""
+    most = most or _asked()
+    found = measure(most, [n_u for n_u in (10**6, 3 * 10**6, 10**7) if n_u > most])
     found["completion"] = [completion(n_c, v_th) for v_th in WANTED for n_c in (2, 4, 8)]
-    rows = [{"name": f"against {name}", **row} for name, part in found.items() for row in part]
+    rows = [{"against": name, **row} for name, part in found.items() for row in part]
     OUT.mkdir(parents=True, exist_ok=True)
     (OUT / "overhead.json").write_text(json.dumps(found, indent=1) + "\n")
     draw(found, OUT / "overhead.png")
-    return [*rows, steering()]
+    written = {"written": ", ".join(sorted(str(path) for path in OUT.glob("overhead.*")))}
+    return [*rows, steering(), written]
+
+
+def _asked() -> int:
+    """How far is measured."""
+    text = os.environ.get("DAGMAP_BENCH_MOST", "1000000")
+    if not text.isdecimal() or int(text) < FEATURES:
+        raise DagmapError(
+            f"DAGMAP_BENCH_MOST = {text!r}: a number of features is wanted, {FEATURES} at least"
+        )
+    return int(text)
 
 
 def draw(found: dict[str, list[Row]], path: Path) -> None:

@@ -150,13 +150,20 @@ class Make:
         said = self.of(kind, self.header(stamp, "camera"), form, np.frombuffer(data, np.uint8))
         return topic, kind, stamp, said
 
-    def camera_info(self, stamp: float, fx: float = 100.0) -> Message:
+    def camera_info(
+        self,
+        stamp: float,
+        fx: float = 100.0,
+        model: str = "plumb_bob",
+        d: tuple[float, ...] = (0.0,) * 5,
+        p: tuple[float, ...] = (0.0,) * 12,
+    ) -> Message:
         kind = "sensor_msgs/msg/CameraInfo"
         k = np.array([fx, 0, 80.0, 0, 110.0, 60.0, 0, 0, 1.0])
         roi = self.of("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
         said = self.of(
-            kind, self.header(stamp, "camera"), HEIGHT, WIDTH, "plumb_bob", np.zeros(5), k,
-            np.eye(3).ravel(), np.zeros(12), 0, 0, roi,
+            kind, self.header(stamp, "camera"), HEIGHT, WIDTH, model, np.array(d), k,
+            np.eye(3).ravel(), np.array(p), 0, 0, roi,
         )  # fmt: skip
         return "/camera/color/camera_info", kind, stamp, said
 

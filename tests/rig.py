@@ -118,11 +118,12 @@ def write_rig(path: Path, count: int, truth: bool = True, fisheye: bool = False)
     return path
 
 
-def tum(count: int, nanoseconds: bool = False) -> str:
-    """Poses of the left camera."""
+def tum(count: int, nanoseconds: bool = False, body: bool = False) -> str:
+    """Poses of the left camera, or of the body, as an inertial SLAM has them."""
     lines = ""
     for i in range(count):
         stamp, pose = START + STEP * i, camera_pose(i)
+        pose = pose @ np.linalg.inv(MOUNTED[0]) if body else pose
         moment = f"{stamp}.000000" if nanoseconds else f"{stamp / 1e9:.6f}"
         numbers = [*pose[:3, 3], *quaternion(pose[:3, :3])]
         lines += " ".join([moment, *map(str, numbers)]) + "\n"

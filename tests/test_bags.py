@@ -119,6 +119,31 @@ def test_pictures_with_depth(tmp_path: Path, name: str, compressed: bool) -> Non
     assert set(uses) == {"poses", "depth", "colour", "camera"}
 
 
+def posed(make: Make, stamp: float) -> Message:
+    kind, pose = "geometry_msgs/msg/PoseStamped", make.pose(make.sensor(stamp))
+    return "/pose", kind, stamp, make.of(kind, make.header(stamp, "map"), pose)
+
+
+@pytest.mark.parametrize("topic", ["/odom", "/pose"])
+def test_poses_of_an_unnamed_frame_are_told_of(tmp_path: Path, topic: str) -> None:
+    """They count as the sensor's, and that may be wrong."""
+    make = Make()
+    poses = [
+        make.odometry(1.0 + 0.1 * i, "") if topic == "/odom" else posed(make, 1.0 + 0.1 * i)
+        for i in range(12)
+    ]
+    path = write_bag(tmp_path / "walk.mcap", make, in_order([*poses, *make.clouds()]))
+    first, doubt = describe_source(path).notes
+    assert first == f"poses of {topic}"
+    assert doubt.startswith(f"{topic} does not say what it is the pose of")
+    assert "--same-frame" in doubt and "--topic /tf" in doubt
+    assert describe_source(path, Options(same_frame=True)).notes == (f"poses of {topic}",)
+    run = dagmap("inspect", path)
+    assert doubt in run.stdout
+    run = dagmap("replay", path, "--out", tmp_path / "out")
+    assert run.returncode == 0 and f"walk: {doubt}" in run.stderr
+
+
 def test_topics_that_are_named_are_used(tmp_path: Path) -> None:
     make = Make()
     other = [("/other", kind, stamp, said) for _, kind, stamp, said in make.clouds(3)]

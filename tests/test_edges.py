@@ -131,6 +131,7 @@ HEAD, LENGTH = number(0) + number(0) + FRAME, 1 << 40
 MESSAGE_EDGES = {
     "more": (1, b"\x01", b"\x02"),
     "a transaction": (1, b"\0" + number(56_000) + bytes(56_000), b"\0" + number(56_001)),
+    "a small transaction": (1, b"\0" + number(105) + bytes(105), b"\0" + number(104) + bytes(104)),
     "echoes": (2, number(0) + number(8) + (FRAME + b"\0\0") * 8, number(0) + number(9)),
     "length": (2, HEAD + number(2 * LENGTH) + FRAME, HEAD + number(2 * LENGTH + 1) + FRAME + b"\0"),
     "length with proof": (
@@ -148,6 +149,7 @@ MESSAGE_EDGES = {
         number(1) + FRAME + b"\0" + number(LENGTH) + b"\0\0",
         number(1) + FRAME + b"\0" + number(LENGTH + 1) + b"\0\0",
     ),
+    "proofs": (3, b"\0\0\2" + FRAME + FRAME[::-1], b"\0\0\2" + FRAME * 2),
     "end": (3, b"\0\0\0", b"\0\0\0\0"),
     "kind": (3, b"\0\0\0", None),
 }

@@ -7,7 +7,10 @@ import math
 import numpy as np
 import pytest
 
+from dagmap import Config, GraphConfig
+from dagmap.config import OverheadConfig
 from dagmap.equations import Fit, Model, Size, Work, t_broadcast, t_insertion, t_merge
+from dagmap.overhead import Controller
 
 
 def test_the_equations_are_those_of_the_paper() -> None:
@@ -73,3 +76,26 @@ def test_a_fit_follows_a_change_and_never_goes_below_nothing() -> None:
 
 def test_work_is_the_difference_of_two_counts() -> None:
     assert Work(5, 4, 3, 2, 1).since(Work(1, 1, 1, 1, 1)) == Work(4, 3, 2, 1, 0)
+
+
+def test_fewer_are_sent_again_before_fewer_are_inserted() -> None:
+    """Though N_c is at its most, and so was never given back: what was cut once may be cut anew."""
+    graph = GraphConfig(n_c=4, n_c_max=4)
+    controller = Controller(Config(graph=graph, overhead=OverheadConfig(cycle_share=0.5)))
+    now = 0.0
+
+    def cycle(seconds: float, sent: int) -> None:
+        nonlocal now
+        controller.took(seconds)
+        controller.work.inserted += 1000
+        controller.work.sent += sent
+        now += 1.0
+        controller.cycle(now, 1000, 0, 0)
+
+    for _ in range(2):
+        cycle(0.8, 1000)
+        cycle(0.8, 1000)
+        assert controller.n_f is not None and controller.features is None
+        for _ in range(60):
+            cycle(0.01, 100)
+        assert controller.n_f is None and controller.features is None

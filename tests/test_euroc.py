@@ -14,7 +14,7 @@ import pytest
 import rig
 from dagmap.io.sources import Options, describe_source, open_source
 from dagmap.io.sources._poses import inverse
-from dagmap.model import Cycle, RecordingError
+from dagmap.model import ConfigError, Cycle, RecordingError
 from test_replay import dagmap
 
 COUNT = 5
@@ -80,6 +80,29 @@ def test_poses_of_a_slam(walk: Path, tmp_path: Path, nanoseconds: bool) -> None:
     (tmp_path / "slam.txt").write_text(rig.tum(COUNT, nanoseconds))
     shutil.rmtree(walk / "mav0" / TRUTH)
     check(list(open_source(walk, Options(poses=tmp_path / "slam.txt"))))
+
+
+def test_poses_of_an_inertial_slam(walk: Path, tmp_path: Path) -> None:
+    (tmp_path / "f_walk.txt").write_text(rig.tum(COUNT, nanoseconds=True, body=True))
+    shutil.rmtree(walk / "mav0" / TRUTH)
+    options = Options(poses=tmp_path / "f_walk.txt", body_poses=True)
+    check(list(open_source(walk, options)))
+    (note,) = describe_source(walk, options).notes
+    assert note == f"poses of {tmp_path / 'f_walk.txt'}, those of the body"
+
+
+def test_poses_that_may_be_those_of_the_body_are_told_of(walk: Path, tmp_path: Path) -> None:
+    poses = tmp_path / "f_walk.txt"
+    poses.write_text(rig.tum(COUNT, nanoseconds=True))
+    _, doubt = describe_source(walk, Options(poses=poses)).notes
+    assert "taken for those of the left camera" in doubt and "--body-poses" in doubt
+    assert len(describe_source(walk, Options(poses=poses, same_frame=True)).notes) == 1
+    run = dagmap("inspect", walk, "--poses", poses, "--body-poses")
+    assert "those of the body" in run.stdout and doubt not in run.stdout
+    poses.write_text(rig.tum(COUNT))  # in s: ORB-SLAM3 saves these of the camera always
+    assert describe_source(walk, Options(poses=poses)).notes == (f"poses of {poses}",)
+    with pytest.raises(ConfigError, match="body_poses and same_frame"):
+        Options(body_poses=True, same_frame=True)
 
 
 def test_pictures_alone_suffice(walk: Path) -> None:

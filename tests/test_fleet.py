@@ -252,6 +252,7 @@ class TestStatus:
             show_status(Path(a.socket), as_json=True)
         shown = capsys.readouterr().out
         assert answers[0]["digest"] in shown and "itself" in shown and " ms " in shown
+        assert "% of a cycle of " in shown and "N_c 2" in shown
         assert '"name": "b"' in shown
 
 

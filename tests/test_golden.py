@@ -196,8 +196,8 @@ def test_envelopes() -> None:
 
 MESSAGES: dict[str, tuple[Message, str]] = {
     "transactions": (
-        Transactions((b"one", b"another"), True),
-        "444d0101dd7a25f72ba2868b73656e646572696401036f6e6507616e6f74686572",
+        Transactions((b"1" * 105, b"2" * 130), True),
+        "444d0101dd7a25f72ba2868b73656e6465726964" + "0169" + "31" * 105 + "8201" + "32" * 130,
     ),
     "heads": (
         Heads(

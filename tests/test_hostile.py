@@ -5,16 +5,27 @@ Each of these once raised, cost too much, or drove honest robots apart.
 
 from __future__ import annotations
 
+import zlib
+
 import msgspec
 import numpy as np
 import pytest
 
 from chains import CONFIG, Author, bundle, identity
 from dagmap import Agent, Cycle
-from dagmap.config import IssuanceConfig
+from dagmap.config import IssuanceConfig, OverheadConfig
 from dagmap.messages import Head, Heads, Transactions, Want, encode
 from dagmap.messages import parse as parse_message
-from dagmap.model import FLEET_FRAME, Accepted, CycleError, Forked, FrameId, quantise_pose
+from dagmap.model import (
+    FLEET_FRAME,
+    Accepted,
+    CycleError,
+    Forked,
+    FrameId,
+    Reason,
+    Rejected,
+    quantise_pose,
+)
 from dagmap.payload import Anchor, Bundle, Link, Payload
 from dagmap.transaction import Transaction, parse, seal
 
@@ -49,6 +60,54 @@ def test_false_heads_cost_bounded_memory():
         agent.receive(encode(Heads(1, (), heads), CONFIG, b"somebody"), float(k))
     held = len(agent.sync._asked) + sum(len(p.heads) for p in agent.sync.peers.values())
     assert held <= 2 * 4096, held
+
+
+def test_a_message_of_many_nothings_costs_one_refusal():
+    agent = Agent(identity("me"), CONFIG)
+    head = encode(Transactions(()), CONFIG, b"somebody")[:28]
+    data = head + b"\0" + b"\0" * 59_900
+    events = agent.receive(data + zlib.crc32(data).to_bytes(4, "little"), 0.0)
+    assert [type(event) for event in events] == [Rejected]
+
+
+def test_what_follows_one_that_nobody_could_accept_is_left_unread():
+    agent, honest, liar = Agent(identity("me"), CONFIG), Author("honest"), Author("liar")
+    good, bad = honest.make(), Author("other").make()
+    forged = bad.data[:-1] + bytes([bad.data[-1] ^ 1])
+    items = (forged, good.data)
+    events = agent.receive(encode(Transactions(items), CONFIG, b"somebody"), 0.0)
+    assert [type(event) for event in events] == [Rejected] and good.id not in agent.ledger
+    # What an honest robot may hold, that has not heard of a fork yet, keeps nobody from the rest.
+    first = liar.make()
+    twin = Author("liar").make(payload=Payload(name="twin"))
+    rx(agent, first, twin)
+    late = Author("liar")
+    late.chain.append(first)
+    rx(agent, late.make(), good)
+    assert good.id in agent.ledger
+
+
+def test_a_question_that_asks_for_the_same_twice_is_refused():
+    agent = Agent(identity("me"), CONFIG)
+    me = agent.identity.author
+    for want in (
+        Want(((me, 0, 9), (me, 0, 9))),
+        Want((), (bytes(32),) * 2),
+        Want((), (), (me, me)),
+    ):
+        events = agent.receive(encode(want, CONFIG, b"somebody"), 0.0)
+        assert [event.reason for event in events] == [Reason.MALFORMED]
+        assert agent.outbox() == []
+
+
+def test_questions_that_a_cap_holds_back_are_bounded():
+    capped = msgspec.structs.replace(CONFIG, overhead=OverheadConfig(robot_bytes_per_second=5e4))
+    agent = Agent(identity("me"), capped)
+    agent.tick(0.0)
+    for k in range(200):  # forks that nobody has heard of, all to be asked for
+        forks = (Head((500 * k + i).to_bytes(8, "big"), 2, bytes(8), 0) for i in range(500))
+        agent.receive(encode(Heads(k, (), tuple(forks)), capped, b"somebody"), 0.001 * k)
+    assert sum(map(len, agent.steering.shaper._queues)) <= 64
 
 
 def test_a_liar_does_not_move_two_honest_robots_apart():

@@ -17,7 +17,7 @@ from scene import QUICK, agent, cycles
 
 ME = b"12345678"
 SAMPLES: list[Message] = [
-    Transactions((b"abc", b"", b"x" * 300), more=True),
+    Transactions((b"a" * 105, b"x" * 300), more=True),
     Transactions(()),
     Heads(
         7,
@@ -91,9 +91,9 @@ def test_a_bad_transaction_in_a_good_message_is_a_rejection() -> None:
     listener = agent("listener")
     good = Author("a", QUICK).make().data
     bad = good[:-1] + bytes([good[-1] ^ 1])
-    events = listener.receive(messages.encode(Transactions((bad, good)), QUICK, ME), 0.0)
-    assert [type(e).__name__ for e in events] == ["Rejected", "Accepted"]
-    assert events[0].reason is Reason.SIGNATURE
+    events = listener.receive(messages.encode(Transactions((good, bad)), QUICK, ME), 0.0)
+    assert [type(e).__name__ for e in events] == ["Accepted", "Rejected"]
+    assert events[1].reason is Reason.SIGNATURE
 
 
 def test_messages_stay_below_their_size() -> None:

@@ -86,6 +86,31 @@ def test_other_names_and_kinds_of_files(map_: Path) -> None:
     assert np.allclose(placed(map_), points(), atol=1e-6)
 
 
+@pytest.mark.parametrize("place", ["mav0/cam0", "cam0", "."])
+def test_key_frames_of_the_body_are_brought_to_the_camera(map_: Path, place: str) -> None:
+    (map_ / "KeyFrameTrajectory.txt").unlink()
+    (map_ / "kf_dataset-MH01_stereoi.txt").write_text(rig.tum(COUNT, nanoseconds=True, body=True))
+    doubt = describe_source(map_).notes[1]
+    assert doubt.startswith("the stamps of kf_dataset-MH01_stereoi.txt are in ns")
+    assert "--body-poses" in doubt and "--same-frame" in doubt
+    known = describe_source(map_, Options(same_frame=True)).notes
+    assert doubt not in known and len(known) == 2
+    body = Options(body_poses=True)
+    with pytest.raises(RecordingError, match="mav0/cam0/sensor.yaml: missing; .*T_BS"):
+        open_source(map_, body)
+    (map_ / place).mkdir(parents=True, exist_ok=True)
+    (map_ / place / "sensor.yaml").write_text(rig.sensor_yaml(0))
+    for i, cycle in enumerate(open_source(map_, body)):
+        assert np.allclose(cycle.pose, rig.camera_pose(i), atol=1e-6)
+    assert np.allclose(placed(map_, body), points(), atol=1e-6)
+    assert (
+        f"brought to the camera by {map_ / place / 'sensor.yaml'}"
+        in describe_source(map_, body).notes[1]
+    )
+    run = dagmap("inspect", map_, "--body-poses")
+    assert run.returncode == 0 and "brought to the camera" in run.stdout
+
+
 def test_a_map_to_share(map_: Path, tmp_path: Path) -> None:
     run = dagmap("replay", map_, "--out", tmp_path / "out", "--json")
     assert run.returncode == 0, run.stderr

@@ -54,6 +54,21 @@ def test_the_image_is_built_from_what_is_there() -> None:
             assert "--require-hashes" in words or "--no-deps" in words
 
 
+def test_the_image_reads_bags() -> None:
+    """What it installs, by name, has what bags and their pictures need."""
+    sys.path.insert(0, str(PACKAGING))
+    try:
+        from check_wheels import requirements
+    finally:
+        sys.path.pop(0)
+    file = next(rest for head, rest in lines() if head == "RUN" and "--require-hashes" in rest)
+    locked = (ROOT / shlex.split(file)[-1]).read_text()
+    names = set(re.findall(r"^([\w.-]+)==", locked, re.M))
+    wanted = requirements(["fleet", "rgbd", "ros"], "x86_64")
+    assert {re.split(r"[<>=]", each)[0] for each in wanted} <= names
+    assert "rosbags" in names and "://" not in locked
+
+
 def test_the_image_installs_from_a_configured_index_only() -> None:
     for file in PACKAGING.iterdir():
         if file.is_file():

@@ -9,9 +9,8 @@ import pytest
 
 import dagmap.agent
 from dagmap import Accepted, Config, Cycle
-from dagmap.agent import Parsers
 from dagmap.io.queues import Inbox, Question, Rates, SendQueue
-from dagmap.messages import Heads, Kind, Transactions, Want, encode, kind_of
+from dagmap.messages import Heads, Kind, Parsers, Transactions, Want, encode, kind_of
 from dagmap.model import Outgoing
 from scene import agent as scene_agent
 from scene import cycles
@@ -39,6 +38,15 @@ class TestInbox:
         assert inbox.take(0).messages == sent[:few]
         assert inbox.take(0).messages == sent[few:]
         assert inbox.take(0).messages == []
+
+    def test_what_is_put_back_comes_first_and_counts_again(self) -> None:
+        inbox = Inbox(4 * (1_000 + Inbox.HELD), 1 << 20)
+        sent = [message(1_000) for _ in range(4)]
+        assert all(map(inbox.put_message, sent))
+        taken = inbox.take(0).messages
+        inbox.put_back(taken[1:])
+        assert inbox.put_message(message(1_000)) and not inbox.put_message(message(1_000))
+        assert inbox.take(0).messages[:3] == sent[1:]
 
     def test_one_sender_cannot_crowd_out_another(self) -> None:
         inbox = Inbox(10 * (1_000 + Inbox.HELD), 4 * (1_000 + Inbox.HELD))
@@ -180,6 +188,14 @@ class TestRates:
         assert len(inbox._throttle._of_one) == Rates().senders
         now[0] += 1.0
         assert self.put(inbox, 50) == 10  # the honest robot's share is there again
+
+    def test_bytes_of_all_hold_whoever_is_named(self) -> None:
+        inbox, now = self.make(bytes=10_000, bytes_of_one=5_000, question=4_000)
+        names = [i.to_bytes(8, "big") for i in range(100)]
+        assert sum(self.put(inbox, 1, 1_000, sender=name) for name in names) == 10
+        now[0] += 1.0
+        wants = [encode(Want(((ME, 0, 1 << 30),)), Config(), name) for name in names]
+        assert sum(map(inbox.put_message, wants)) == 2
 
     def test_what_is_refused_costs_an_honest_robot_nothing(self) -> None:
         inbox, _ = self.make(messages=20, messages_of_one=10)

@@ -74,6 +74,21 @@ class TestPoses:
         assert feed.dropped["clouds"] == 1
         assert feed.problem == "no pose for its moment"
 
+    def test_poses_of_an_unnamed_frame_are_told_of(self) -> None:
+        feed = Feed(RosConfig())
+        give(feed, MAKE.odometry(1.0, ""), MAKE.odometry(1.1, ""))
+        assert feed.assumed == ""  # nothing was made of it yet
+        (cycle,) = give(feed, cloud(1.05), MAKE.odometry(1.2, ""))
+        assert np.allclose(cycle.pose, pose_at(1.05), atol=1e-9)
+        assert feed.assumed.startswith("odom does not say what it is the pose of")
+        assert "same_frame = true" in feed.assumed and feed.problem is None
+        feed = Feed(RosConfig(same_frame=True))
+        give(feed, MAKE.odometry(1.0, ""), MAKE.odometry(1.2, ""), cloud(1.05))
+        assert feed.assumed == ""
+        feed = Feed(RosConfig())
+        give(feed, MAKE.mount(), MAKE.odometry(1.0), MAKE.odometry(1.2), cloud(1.05))
+        assert feed.assumed == ""
+
     def test_by_tf_alone(self) -> None:
         feed = Feed(RosConfig(odometry=""))
         assert [topic.role for topic in wanted(RosConfig(odometry=""))] == [
@@ -388,6 +403,18 @@ def test_the_log_says_why_there_are_no_cycles() -> None:
         bridge._tell(now)
     assert not before and 'event="no cycles"' in said.getvalue()
     assert "nothing was heard yet on points, odom" in said.getvalue()
+
+
+def test_the_log_says_once_what_is_assumed_of_the_poses() -> None:
+    said = io.StringIO()
+    bridge = Bridge(RosConfig(), Recorder(), Inbox(1 << 20, 1 << 20), Log(said, "warning"))
+    give(bridge._feed, MAKE.odometry(1.0, ""), MAKE.odometry(1.2, ""), cloud(1.05))
+    for now in (1.0, 100.0, 200.0):
+        bridge._question = None
+        bridge._tell(now)
+    assert said.getvalue().count('event="frame assumed"') == 1
+    assert "same_frame = true" in said.getvalue() and "no cycles" not in said.getvalue()
+    assert "is taken for the sensor's" in str(bridge._said()[0]["assumed"])
 
 
 @pytest.mark.parametrize("seed", range(4))

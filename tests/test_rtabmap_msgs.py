@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import sqlite3
+import struct
+import zlib
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +17,7 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 
 from bags import Make, Message, pose_at, room, write_bag
-from dagmap import Agent, Config, Identity
+from dagmap import Agent, Config, Cycle, Identity
 from dagmap.config import GraphConfig
 from dagmap.io.ros.types import Types
 from dagmap.io.sources import Options, describe_source, open_source
@@ -214,6 +216,80 @@ class TestChoice:
         point = TYPES.make("rtabmap_msgs/msg/Point3f", x=1.5)
         features = TYPES.make("rtabmap_msgs/msg/SensorData", points=[point])
         assert self.words(word_pts=[], data=features) == [[1.5, 0, 0]]
+
+
+def matrix_bytes(values: np.ndarray, kind: int = 0) -> np.ndarray:
+    """A matrix as RTAB-Map packs it: zlib, then rows, columns and OpenCV's type."""
+    packed = zlib.compress(values.tobytes()) + struct.pack("<iii", *values.shape, kind)
+    return np.frombuffer(packed, np.uint8)
+
+
+class TestDescriptors:
+    WORDS = np.array([[1, 0, 0], [NAN, 0, 0], [0, 0, 0], [9, 0, 0], [2, 0, 0], [3, 0, 0]])
+    ORB = np.arange(6 * 32, dtype=np.uint8).reshape(6, 32)
+
+    def cycles(self, *told: Any, options: Options | None = None) -> list[Cycle]:
+        chosen = options or Options(max_depth=5.0)
+        follower = GraphFollower(chosen, lambda what: None)
+        found = []
+        for number, more in enumerate(told, 1):
+            said = node(number, float(number), np.eye(4), self.WORDS, **more)
+            poses = {n: moved(0.5 * (len(told) - n)) for n in range(1, number + 1)}
+            found += follower.data(data(float(number), [said], poses)[3])
+        return found
+
+    def test_come_with_their_words(self) -> None:
+        (cycle,) = self.cycles({"word_descriptors": matrix_bytes(self.ORB)})
+        assert np.asarray(cycle.points)[:, 0].tolist() == [3, 2, 1]  # the strongest first
+        assert np.array_equal(np.asarray(cycle.descriptors), self.ORB[[5, 4, 0]])
+        few = Options(max_depth=5.0, max_features=1)
+        (cycle,) = self.cycles({"word_descriptors": matrix_bytes(self.ORB)}, options=few)
+        assert np.array_equal(np.asarray(cycle.descriptors), self.ORB[[5]])
+
+    def test_stay_with_a_cycle_that_brings_moves(self) -> None:
+        more = {"word_descriptors": matrix_bytes(self.ORB)}
+        poses = {1: np.eye(4), 2: moved(1.0)}
+        follower = GraphFollower(Options(), lambda what: None)
+        follower.data(data(1.0, [node(1, 1.0, np.eye(4), self.WORDS)], {1: np.eye(4)})[3])
+        follower.data(data(2.0, [node(2, 2.0, np.eye(4), self.WORDS)], poses)[3])
+        closed = {1: np.eye(4), 2: moved(1.5), 3: moved(2.0)}
+        said = data(3.0, [node(3, 3.0, np.eye(4), self.WORDS, **more)], closed)[3]
+        (cycle,) = follower.data(said)
+        assert cycle.moved is not None and cycle.descriptors is not None
+
+    def test_of_local_features_where_there_are_no_words(self) -> None:
+        points = [TYPES.make("rtabmap_msgs/msg/Point3f", x=x) for x in (1.0, 2.0)]
+        described = matrix_bytes(self.ORB[:2])
+        features = TYPES.make("rtabmap_msgs/msg/SensorData", points=points, descriptors=described)
+        (cycle,) = self.cycles({"word_pts": [], "data": features})
+        assert np.array_equal(np.asarray(cycle.descriptors), self.ORB[:2])
+
+    @pytest.mark.parametrize(
+        "packed",
+        [
+            np.zeros(0, np.uint8),
+            matrix_bytes(ORB[:5]),  # of fewer words
+            matrix_bytes(ORB.reshape(3, 64)),  # of another kind
+            matrix_bytes(ORB.reshape(12, 16)),
+            matrix_bytes(np.zeros((6, 32), np.float32), 5),  # SURF
+            matrix_bytes(ORB)[2:],
+            matrix_bytes(ORB)[:7],
+        ],
+    )
+    def test_that_do_not_fit_are_left_out(self, packed: np.ndarray) -> None:
+        (cycle,) = self.cycles({"word_descriptors": packed})
+        assert len(np.asarray(cycle.points)) == 3 and cycle.descriptors is None
+
+    def test_by_the_name_of_ros_1(self) -> None:
+        said = data(1.0, [node(1, 1.0, np.eye(4), self.WORDS)], {1: np.eye(4)})[3]
+        fields = {name: getattr(said.nodes[0], name) for name in ("id", "stamp", "pose", "data")}
+        fields["wordDescriptors"] = matrix_bytes(self.ORB)
+        fields |= {"wordPts": said.nodes[0].word_pts, "wordKpts": said.nodes[0].word_kpts}
+        old = SimpleNamespace(
+            header=said.header, graph=said.graph, nodes=[SimpleNamespace(**fields)]
+        )
+        (cycle,) = GraphFollower(Options(), lambda what: None).data(old)
+        assert np.array_equal(np.asarray(cycle.descriptors)[0], self.ORB[5])
 
 
 class TestSessions:

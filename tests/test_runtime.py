@@ -13,6 +13,7 @@ import pytest
 
 from chains import Author
 from dagmap import Agent
+from dagmap.io import runtime as runtime_module
 from dagmap.io.log import Log
 from dagmap.io.player import Player
 from dagmap.io.queues import Inbox, Question
@@ -106,6 +107,24 @@ class TestRuntime:
         assert all(runtime.inbox.put_message(data) for data in messages)
         runtime.run(until_agreed=0.05)
         assert disk.commits == 1 and len(disk.stored) == len(other.ledger)
+
+    def test_messages_that_take_long_do_not_hold_up_a_cycle(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        runtime, disk, _, _ = make()
+        monkeypatch.setattr(runtime_module, "_READING", 0.0)  # as if each took all of the time
+        other = scene_agent("b")
+        mine, *others = cycles(1, churn=False)
+        for cycle in others:
+            other.observe(cycle, cycle.stamp)
+        messages = [out.data for out in other.outbox()]
+        assert all(runtime.inbox.put_message(data) for data in messages) and len(messages) > 3
+        runtime._step()
+        runtime.inbox.put_cycle(mine)
+        runtime._step()
+        assert runtime.counts.cycles == 1 and runtime.inbox.unread
+        runtime.run(until_agreed=0.05)
+        assert {tx.id for tx in other.ledger} <= disk.stored.keys()
 
     def test_foreign_bytes_are_counted_and_seldom_logged(self) -> None:
         runtime, disk, _, log = make()

@@ -68,7 +68,7 @@ class TestFile:
         bounds += [f"network.{key}" for key in network if re.search("bytes|messages|_remem", key)]
         spread = config.sync.__struct_fields__
         bounds += [f"sync.{key}" for key in spread if not key.endswith("period")]
-        assert set(bounds) <= rows.keys() and len(bounds) == 18
+        assert set(bounds) <= rows.keys() and len(bounds) == 19
 
 
 class TestMistakes:

@@ -170,6 +170,35 @@ def test_a_cap_holds_over_any_five_seconds(cap: int) -> None:
     assert len(newcomer.ledger) > 0
 
 
+@pytest.mark.parametrize("cap", [500, 1000])
+def test_an_answer_larger_than_the_cap_of_seconds_goes_out_all_the_same(cap: int) -> None:
+    """And does not keep what the robot has to say itself."""
+    capped = msgspec.structs.replace(
+        PLAIN, overhead=OverheadConfig(robot_bytes_per_second=float(cap))
+    )
+    theirs, own = np.random.default_rng(5).uniform([2, -1, -1], [3, 1, 1], (2, 1200, 3))
+    speaker, robot, newcomer = agent("speaker"), agent("robot", capped), agent("newcomer")
+    speaker.observe(Cycle(0.0, np.eye(4), theirs), 0.0)
+    for out in speaker.outbox():
+        robot.receive(out.data, 0.0)
+    (large,) = speaker.ledger
+    assert len(large.data) > 4 * cap and large.id in robot.ledger
+    robot.observe(Cycle(0.0, np.eye(4), own[:100] + 10.0), 0.0)
+    sent: list[tuple[float, int]] = []
+    for step in range(600):
+        now = 0.1 * step
+        for giver, taker in ((robot, newcomer), (newcomer, robot)):
+            giver.tick(now)
+            for out in giver.outbox():
+                if giver is robot:
+                    sent.append((now, len(out.data)))
+                taker.receive(out.data, now)
+    assert {tx.id for tx in newcomer.ledger} == {tx.id for tx in robot.ledger}
+    assert robot.ledger.features(robot.identity.author) > 50
+    most = max(5 * cap, len(large.data) + 100)  # one message is not cut in two
+    assert worst_window(sent) <= 1.05 * most
+
+
 def test_what_is_new_to_the_fleet_goes_first() -> None:
     """Half of what the robot sees stands in the map already; the budget is for a fifth."""
     rng = np.random.default_rng(3)

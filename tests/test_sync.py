@@ -5,8 +5,10 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 
+import pytest
+
 from dagmap import Agent, Cycle
-from dagmap.messages import Heads, Transactions, Want, encode, parse
+from dagmap.messages import Head, Heads, Transactions, Want, encode, parse
 from scene import agent, cycles, pose
 
 Carries = Callable[[str, str], bool]
@@ -174,6 +176,31 @@ def test_heads_of_strangers_cost_one_bounded_question() -> None:
     for i in range(50):
         robot.receive(encode(lie, robot.config, b"liar1234"), 0.01 * i)
     assert len(robot.outbox()) == 1
+
+
+@pytest.mark.parametrize(("names", "rate"), [(1, 400), (300, 300), (1000, 300)])
+def test_false_promises_in_many_names_do_not_keep_a_newcomer_out(names: int, rate: int) -> None:
+    """Announcements are not signed: anybody may promise what no one has, and first."""
+    holder, newcomer = mapped(Radio("holder")).agents["holder"], agent("newcomer")
+    me, config = holder.identity.author, holder.config
+    while holder.holds_back:
+        holder.tick(5.0)
+    holder.outbox()
+    liars = [random.Random(i).randbytes(8) for i in range(names)]
+    false = (Head(me, 1 << 39, bytes(8)),)
+    now, said = 10.0, 0
+    while len(newcomer.ledger) < len(holder.ledger):
+        now += 0.01
+        while said < (now - 10.0) * rate:
+            said += 1
+            liar = liars[said % names]
+            newcomer.receive(encode(Heads(said, (), false), config, liar), now)
+        for giver, taker in ((holder, newcomer), (newcomer, holder)):
+            giver.tick(now)
+            for out in giver.outbox():
+                if out.to in (None, taker.identity.author):
+                    taker.receive(out.data, now)
+        assert now < 40.0, (len(newcomer.ledger), len(holder.ledger))
 
 
 def test_delay_is_measured_by_echoed_tokens() -> None:

@@ -41,7 +41,8 @@ def seeds() -> Iterable[bytes]:
     me, other, third = (robot.author for robot in ROBOTS)
     samples = (
         Transactions(()),
-        Transactions((b"one", b"", bytes(300)), more=True),
+        Transactions((b"one" * 35, bytes(300)), more=True),
+        Transactions((b"short",)),
         Heads(0, (), ()),
         Heads(
             1 << 40,
@@ -49,6 +50,7 @@ def seeds() -> Iterable[bytes]:
             (Head(me, 5, b"tip tip "), Head(other, 0, bytes(8)), Head(third, 9, b"tip tip ", 4)),
         ),
         Want(),
+        Want(((me, 0, 1), (me, 0, 2))),
         Want(((me, 0, 1), (other, 300, 70_000)), (bytes(32), b"i" * 32), (third,)),
     )
     return [messages.encode(sample, CONFIG, me) for sample in samples]

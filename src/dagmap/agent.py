@@ -7,18 +7,17 @@ socket, disk, chance or log in here or below.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from . import checkpoint as checkpoints
-from . import messages
 from .config import Config
 from .consensus import Consensus
 from .identity import Identity, check_certificate
 from .ledger import Ledger
-from .messages import Heads, Message, Transactions
+from .messages import Heads, Parsers, Transactions
 from .model import (
     FLEET_FRAME,
     Accepted,
@@ -33,6 +32,7 @@ from .model import (
     Issued,
     MapChanged,
     Outgoing,
+    Reason,
     Rejected,
     Revoked,
     TransactionId,
@@ -45,17 +45,12 @@ from .placing import Placing
 from .shaping import Urgency
 from .steering import Steering
 from .sync import Sync
-from .transaction import Transaction, glance, id_of, parse, seal
+from .transaction import Transaction, glance, id_of, seal
 from .wire import Refusal
-from .worldmap import WorldMap, build_map
+from .worldmap import WorldMap, build_map, newest_poses
 
-
-@dataclass(frozen=True, slots=True)
-class Parsers:
-    """How foreign bytes are judged: pure functions, so agents of one process may share results."""
-
-    message: Callable[[bytes, Config], tuple[AuthorId, Message]] = messages.parse
-    transaction: Callable[[bytes, Config], Transaction] = parse
+# Why a robot refuses what an honest one may still hold: that has not heard of the proof yet.
+_MAY_BE_NEWS = (Reason.FORK, Reason.REVOKED)
 
 
 class Agent:
@@ -139,8 +134,9 @@ class Agent:
         except Refusal as refusal:
             return [Rejected(refusal.reason, refusal.fault, refusal.detail)]
         if isinstance(message, Transactions):
-            events = [e for item in message.data for e in self._through_the_door(item)]
-            self.steering.post(self.sync.answered(sender, message, now), Urgency.CONTROL)
+            events = self._take_all(message.data)
+            news = any(isinstance(event, Accepted) for event in events)
+            self.steering.post(self.sync.answered(sender, message, now, news), Urgency.CONTROL)
         elif isinstance(message, Heads):
             events = []
             self.steering.post(self.sync.heard(sender, message, now), Urgency.CONTROL)
@@ -239,16 +235,7 @@ class Agent:
     def robots(self) -> dict[str, tuple[Floats, float]]:
         """Newest pose (4, 4) in this robot's component, and its stamp in s, by robot's name."""
         self._catch_up()
-        here, found = self._component, {}
-        for author in sorted(self.consensus.authors.values(), key=lambda author: author.id):
-            if author.anchors:
-                anchor = author.anchors[max(author.anchors)]
-                component, pose = self.consensus.placement(author.id, anchor.session)
-                if component == here:
-                    place = pose_matrix(pose) @ pose_matrix(anchor.pose)
-                    name = author.name if author.name not in found else None  # names are free
-                    found[name or author.id.hex()] = (place, anchor.stamp / 1e6)
-        return found
+        return newest_poses(self.consensus, self._component)
 
     @property
     def unplaced(self) -> dict[FrameId, str]:
@@ -312,6 +299,18 @@ class Agent:
             events.append(Issued(id_of(data), payload.features, bundles, len(data)))
             self.steering.controller.issued(payload.features, len(data))
             self.steering.post([(Transactions((data,)), None)], Urgency.OWN)
+        return events
+
+    def _take_all(self, items: Iterable[bytes]) -> list[Event]:
+        """Those of one message. Whoever has sent one that nobody could have accepted is not
+        listened to further: or a message would cost as much as a hundred."""
+        events: list[Event] = []
+        for item in items:
+            found = self._through_the_door(item)
+            events += found
+            first = found[0] if found else None  # the first one is about the item itself
+            if isinstance(first, Rejected) and first.reason not in _MAY_BE_NEWS:
+                break
         return events
 
     def _through_the_door(self, data: bytes, again: bool = False) -> list[Event]:

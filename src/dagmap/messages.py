@@ -9,6 +9,7 @@ heads are hints too; a false one costs a bounded question.
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple, TypeAlias
@@ -17,6 +18,9 @@ from . import wire
 from .config import Config
 from .model import AuthorId, Reason, TransactionId
 from .transaction import MAX_SIZE as MAX_TRANSACTION
+from .transaction import MIN_SIZE as MIN_TRANSACTION
+from .transaction import Transaction
+from .transaction import parse as parse_transaction
 from .wire import Reader, Refusal
 
 VERSION = 1
@@ -157,7 +161,10 @@ def _decode_transactions(body: Reader) -> Transactions:
     more = body.number(1) == 1
     data = []
     while body.left:
-        data.append(body.take(body.number(MAX_TRANSACTION)))
+        size = body.number(MAX_TRANSACTION)
+        if size < MIN_TRANSACTION:
+            raise Refusal(Reason.MALFORMED, f"transaction of {size} bytes")
+        data.append(body.take(size))
     return Transactions(tuple(data), more)
 
 
@@ -181,4 +188,15 @@ def _decode_want(body: Reader) -> Want:
     ids = tuple(body.take(32) for _ in range(body.number(body.left)))
     proofs = tuple(body.take(8) for _ in range(body.number(body.left)))
     body.end()
+    for named in (ids, proofs, [author for author, _, _ in ranges]):
+        if len(set(named)) < len(named):  # it would cost more than it gives
+            raise Refusal(Reason.MALFORMED, "a question that asks for the same twice")
     return Want(tuple(ranges), ids, proofs)
+
+
+@dataclass(frozen=True, slots=True)
+class Parsers:
+    """How foreign bytes are judged: pure functions, so agents of one process may share results."""
+
+    message: Callable[[bytes, Config], tuple[AuthorId, Message]] = parse
+    transaction: Callable[[bytes, Config], Transaction] = parse_transaction

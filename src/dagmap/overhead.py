@@ -168,6 +168,7 @@ class Controller:
         elif self.n_f is not None:
             free = done.sent < self.n_f
             self.n_f = None if free else int(_GIVE_BACK * self.n_f) + 1
+            self._tries = 0 if free else self._tries
         elif self.n_c > self._config.graph.n_c:
             self.n_c, self._calm, self._tries = self.n_c - 1, 0, 0
 

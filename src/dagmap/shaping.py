@@ -16,6 +16,7 @@ WINDOW = 5.0  # s: over any such span the cap holds to the byte
 _DEPTH = 0.5  # s that a bucket saves up
 _LEAST = 2048.0  # bytes that it saves up at least, or envelopes would be most of the traffic
 _ANSWERS = 0.25  # share of the rate for answers while the robot has something to say itself
+_CONTROL = 64  # messages: of more questions the oldest are dropped, to be asked again
 _ANNOUNCED = 0.25  # share of the rate that announcements take at most; others are left out
 
 
@@ -42,6 +43,7 @@ class Shaper:
         self._own = self._answers = 0.0  # bytes saved up; below 0: owed
         self._last: float | None = None
         self._announced = float("-inf")
+        self._held_since = float("inf")  # that the cap alone has held back an answer
         self._window: deque[tuple[float, int]] = deque()  # what went out lately
         self._recent = 0  # bytes in it
 
@@ -49,8 +51,11 @@ class Shaper:
         """Take what is to be sent."""
         if self.rate is None:
             self._let_out(out)
-        else:
-            self._queues[urgency].append(out)
+            return
+        queue = self._queues[urgency]
+        if urgency is Urgency.CONTROL and len(queue) == _CONTROL:
+            queue.popleft()
+        queue.append(out)
 
     def announce(self, outs: list[Outgoing], now: float) -> bool:
         """Take the messages of an announcement, unless they would take too much of the rate.
@@ -58,7 +63,9 @@ class Shaper:
         Returns whether they go out. One left out does no harm: the next one says more.
         """
         size = sum(len(out.data) for out in outs)
-        if self.rate is not None and now - self._announced < size / (_ANNOUNCED * self.rate):
+        if self.rate is not None and (
+            self._starves(now) or now - self._announced < size / (_ANNOUNCED * self.rate)
+        ):
             return False
         self._announced = now
         for out in outs:
@@ -69,8 +76,10 @@ class Shaper:
         """Let out what may go out by now, the urgent first."""
         self._fill(now)
         control, own, answers = self._queues
-        self._own = self._drain(control, self._own, -self._depth, now)
+        if not self._starves(now):
+            self._own = self._drain(control, self._own, -self._depth, now)
         self._answers = self._drain(answers, self._answers, 0.0, now)
+        self._held_since = min(self._held_since, now) if self._yields else float("inf")
         if not self._yields:
             self._own = self._drain(own, self._own, 0.0, now)
 
@@ -106,6 +115,10 @@ class Shaper:
     def _yields(self) -> bool:
         """Whether it is an answer's turn that the cap alone holds back."""
         return bool(self._queues[Urgency.ANSWER]) and self._answers > 0
+
+    def _starves(self, now: float) -> bool:
+        """Whether an answer is so large that it goes out only once nothing else has for long."""
+        return now - self._held_since >= WINDOW
 
     @property
     def _depth(self) -> float:

@@ -3,6 +3,10 @@
 Robots announce how far they hold every author's chain. Whoever lacks something asks one robot
 that has it; the answer is cut into chunks and the asker asks on. A newcomer does the same with an
 empty ledger, so robots that never meet converge through those that do.
+
+Announcements are not signed, so anybody may promise anything in any name. Whoever has given
+transactions is asked before those who only promise, and of these ever more at a time as long as
+nothing comes. So promises that are not kept delay an answer, and cannot keep it away.
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ _SMALL = 2048  # bytes for transactions in a message of a robot whose traffic is
 _LIVE = 5  # announcement periods without a word after which a robot counts as gone
 _LATE = 3  # announcement periods that an echo may take before that means something
 _UNREAD = 8  # retry periods that an answer gets on top while messages wait to be read
+_WIDEST = 64  # robots that are asked the same at a time, once nobody keeps what was promised
 Post = tuple[Message, AuthorId | None]
 
 
@@ -37,6 +42,8 @@ class Peer:
     heard: float = 0.0
     delay: float | None = None  # s, one way, smoothed
     echo: Echo | None = None  # the last one
+    gave: bool = False  # transactions that were lacking here; and no question since was in vain
+    in_vain: int = 0  # questions since then
 
 
 class Echo(NamedTuple):
@@ -53,6 +60,9 @@ class Asked(NamedTuple):
     held: int  # where the range begins, or how far the answer has come
     end: int
     until: float  # s, when it is overdue
+    whom: frozenset[AuthorId]
+    sure: bool  # one of them has given before
+    widest: int  # so many may be asked before it is overdue
 
 
 class Sync:
@@ -68,6 +78,7 @@ class Sync:
         self._sent_at: OrderedDict[int, float] = OrderedDict()
         self._asked: OrderedDict[AuthorId, Asked] = OrderedDict()  # about whose chain
         self._asked_ids: dict[TransactionId, float] = {}  # id: not to be asked for before
+        self._sure_next = False  # ids are asked of those who gave and of all, by turns
 
     def tick(self, now: float, unread: bool = False) -> Iterator[Post]:
         """Announcements that are due, and questions for what waiting transactions lack.
@@ -91,7 +102,8 @@ class Sync:
         peer.token, peer.heard = message.token, now
         self._held()
         waiting, held = self._ledger.waiting_from(), self._ends
-        for head in filterfalse(held.__contains__, message.heads):  # few are news, mostly
+        heads = message.heads[: self._config.heads_remembered]
+        for head in filterfalse(held.__contains__, heads):  # few are news, mostly
             if len(peer.heads) < self._config.heads_remembered and self._promises(head, waiting):
                 peer.heads[head.author] = head
         for whose, token, kept in message.echoes:
@@ -101,16 +113,23 @@ class Sync:
                 peer.delay = delay if peer.delay is None else 0.75 * peer.delay + 0.25 * delay
         yield from self._ask(sender, peer, now)
 
-    def answered(self, sender: AuthorId, message: Transactions, now: float) -> Iterator[Post]:
-        """Transactions came (they are in the ledger by now): ask on where the answer was cut."""
+    def answered(
+        self, sender: AuthorId, message: Transactions, now: float, news: bool = True
+    ) -> Iterator[Post]:
+        """Transactions came (they are in the ledger by now): ask on where the answer was cut.
+
+        news: some of them were lacking here.
+        """
         peer = self.peers.get(sender)
+        if peer is not None and news:
+            peer.gave, peer.in_vain = True, 0
         for author, asked in list(self._asked.items()):
             length = len(self._ledger.chain(author).main)
             if length >= asked.end:
                 del self._asked[author]
             elif length > asked.held:  # the answer is coming: what is left of it gets its time too
                 until = now + self._patience(peer or Peer())
-                self._asked[author] = Asked(length, asked.end, until)
+                self._asked[author] = asked._replace(held=length, until=until, widest=1)
         if message.more and peer is not None:
             for author in peer.heads:
                 self._asked.pop(author, None)
@@ -165,15 +184,20 @@ class Sync:
             known = self._ledger.find(id_)
             if known is not None:
                 yield known.data
-        chains = {author: self._ledger.chain(author).main[a:b] for author, a, b in message.ranges}
-        for tx in heapq.merge(*chains.values(), key=lambda tx: tx.key):  # causes first
+        chains = [self._ledger.chain(author).main for author, _, _ in message.ranges]
+        found = (
+            map(main.__getitem__, range(a, min(b, len(main))))  # nothing is copied
+            for main, (_, a, b) in zip(chains, message.ranges, strict=True)
+        )
+        for tx in heapq.merge(*found, key=lambda tx: tx.key):  # causes first
             yield tx.data
 
     def _peer(self, sender: AuthorId) -> Peer:
         peer = self.peers.setdefault(sender, Peer())
         self.peers.move_to_end(sender)
         while len(self.peers) > self._config.peers_remembered:
-            self.peers.popitem(last=False)
+            others = (id_ for id_, other in self.peers.items() if not other.gave and id_ != sender)
+            del self.peers[next(others, next(iter(self.peers)))]
         return peer
 
     def _announce(self, now: float) -> Iterator[Post]:
@@ -200,14 +224,47 @@ class Sync:
         return self._heads
 
     def _ask_again(self, now: float) -> Iterator[Post]:
-        """Where an answer is overdue, ask another robot that has promised the same."""
-        late = [author for author, asked in self._asked.items() if now >= asked.until]
-        for sender, peer in list(self.peers.items()) if late else ():
-            overdue = {author: peer.heads[author] for author in late if author in peer.heads}
-            if overdue:
+        """Where an answer is overdue, ask others that have promised the same."""
+        late = {author for author, asked in self._asked.items() if now >= asked.until}
+        for author in sorted(late):
+            self._in_vain(author)
+        for sender, peer in self._surest() if late else ():
+            heads = {author: peer.heads[author] for author in late & peer.heads.keys()}
+            for post in self._ask(sender, peer, now, heads):
                 self.peers.move_to_end(sender)
-                yield from self._ask(sender, peer, now, overdue)
-                late = [author for author in late if author not in overdue]
+                yield post
+
+    def _surest(self) -> list[tuple[AuthorId, Peer]]:
+        """Those first who gave, or were in vain least; of these who was not asked for longest."""
+        return sorted(self.peers.items(), key=lambda item: (not item[1].gave, item[1].in_vain))
+
+    def _turn_of(
+        self, sender: AuthorId, peer: Peer, author: AuthorId, lacking: tuple[int, int], now: float
+    ) -> bool:
+        """Whether it is a robot's turn to be asked about an author; then it counts as asked."""
+        asked = self._asked.get(author)
+        if asked is not None and asked.whom and now >= asked.until:
+            self._in_vain(author)
+            asked = self._asked[author]
+        whom = frozenset() if asked is None else asked.whom
+        if asked is not None and whom:  # the answer may still come
+            more = peer.gave or len(whom) < asked.widest
+            if asked.sure or sender in whom or not more:
+                return False
+        widest = 1 if asked is None else asked.widest
+        until = now + self._patience(peer)
+        self._asked[author] = Asked(*lacking, until, whom | {sender}, peer.gave, widest)
+        self._asked.move_to_end(author)
+        return True
+
+    def _in_vain(self, author: AuthorId) -> None:
+        """A question was not answered: nobody of those asked is sure any more."""
+        asked = self._asked[author]
+        for id_ in sorted(asked.whom & self.peers.keys()):
+            peer = self.peers[id_]
+            peer.gave, peer.in_vain = False, peer.in_vain + 1
+        widest = 1 if asked.sure else min(2 * asked.widest, _WIDEST)
+        self._asked[author] = asked._replace(whom=frozenset(), sure=False, widest=widest)
 
     def _ask(
         self, sender: AuthorId, peer: Peer, now: float, heads: dict[AuthorId, Head] | None = None
@@ -218,15 +275,13 @@ class Sync:
             if self._proves(head):
                 proofs.append(head.author)
             wanted = self._wanted(head, waiting)
-            before = self._asked.get(head.author)
-            if wanted is not None and (before is None or now >= before.until):
-                self._asked[head.author] = Asked(*wanted, now + self._patience(peer))
-                self._asked.move_to_end(head.author)
+            if wanted is not None and self._turn_of(sender, peer, head.author, wanted, now):
                 if len(self._asked) > 2 * self._config.heads_remembered:
                     self._asked.popitem(last=False)
                 ranges.append((head.author, *wanted))
         if ranges or proofs:
-            yield Want(tuple(ranges), (), tuple(proofs)), sender
+            most = self._config.ids_per_question
+            yield Want(tuple(ranges), (), tuple(proofs[:most])), sender
 
     def _patience(self, peer: Peer) -> float:
         """How long an answer may take, s: a few round trips, where they were measured."""
@@ -269,7 +324,8 @@ class Sync:
                 self._asked_ids[id_] = now + self._config.retry_period
                 due.append(id_)
         if due and self.peers:
-            whom = next(iter(self.peers))
+            self._sure_next = not self._sure_next
+            whom = self._surest()[0][0] if self._sure_next else next(iter(self.peers))
             self.peers.move_to_end(whom)
             yield Want((), tuple(due)), whom
 

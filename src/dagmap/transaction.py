@@ -28,6 +28,7 @@ from .wire import Reader, Refusal
 
 VERSION = 1
 MAX_SIZE = 56_000  # bytes, so that a message that carries one stays under 60 KB
+MIN_SIZE = 105  # one that says nothing
 MAX_LAMPORT = (1 << 48) - 1
 _END = 4 + 64  # bytes: nonce and signature
 _SIGNED = b"dagmap transaction 1\0"

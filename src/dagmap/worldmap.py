@@ -9,9 +9,10 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from .consensus import Consensus
 from .fold import NodeColumns, Verdict
 from .folded import Picture
-from .model import Bools, Floats, FrameId, Int32s, Int64s, State, TransactionId, Uint8s
+from .model import Bools, Floats, FrameId, Int32s, Int64s, State, TransactionId, Uint8s, pose_matrix
 
 D = TypeVar("D", bound=np.generic)
 GREY = 128  # colour of nodes that no observation gave one
@@ -229,3 +230,17 @@ def _mean_color(total: Int64s, count: Int32s) -> Uint8s:
 def _frozen(array: npt.NDArray[D]) -> npt.NDArray[D]:
     array.flags.writeable = False
     return array
+
+
+def newest_poses(consensus: Consensus, here: FrameId) -> dict[str, tuple[Floats, float]]:
+    """Newest pose (4, 4) in a component, and its stamp in s, by robot's name."""
+    found: dict[str, tuple[Floats, float]] = {}
+    for author in sorted(consensus.authors.values(), key=lambda author: author.id):
+        if author.anchors:
+            anchor = author.anchors[max(author.anchors)]
+            component, pose = consensus.placement(author.id, anchor.session)
+            if component == here:
+                place = pose_matrix(pose) @ pose_matrix(anchor.pose)
+                name = author.name if author.name not in found else None  # names are free
+                found[name or author.id.hex()] = (place, anchor.stamp / 1e6)
+    return found

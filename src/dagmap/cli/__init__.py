@@ -26,6 +26,10 @@ _Topic = Annotated[
 _Frame = Annotated[str | None, typer.Option(help="Of a bag with tf: the frame that stands still.")]
 _SameFrame = Annotated[bool, typer.Option(help="Poses are the sensor's, whatever frames say.")]
 _Poses = Annotated[Path | None, typer.Option(help="File of poses, TUM or KITTI (clouds, EuRoC).")]
+_BodyPoses = Annotated[
+    bool,
+    typer.Option("--body-poses", help="Poses of a SLAM are the body's (IMU), not the camera's."),
+]
 _Voxel = Annotated[float, typer.Option(help="Of a cloud one point a voxel is kept, m.")]
 _KeepGoing = Annotated[bool, typer.Option(help="Leave out what cannot be read.")]
 
@@ -65,6 +69,7 @@ def replay(
     frame: _Frame = None,
     same_frame: _SameFrame = False,
     poses: _Poses = None,
+    body_poses: _BodyPoses = False,
     voxel: _Voxel = 0.1,
     keep_going: _KeepGoing = False,
     camera: Annotated[
@@ -85,7 +90,7 @@ def replay(
 
     options = Options(
         camera, max_features, max_depth, tuple(topic or ()), frame, same_frame, poses, voxel,
-        keep_going,
+        keep_going, body_poses,
     )  # fmt: skip
     replay = Replay(
         recordings, out, config, loss, late or [], seed, options, unknown_frames, force, json
@@ -101,6 +106,7 @@ def inspect(
     frame: _Frame = None,
     same_frame: _SameFrame = False,
     poses: _Poses = None,
+    body_poses: _BodyPoses = False,
     keep_going: _KeepGoing = False,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
@@ -110,7 +116,7 @@ def inspect(
 
     options = Options(
         camera, topics=tuple(topic or ()), frame=frame, same_frame=same_frame, poses=poses,
-        keep_going=keep_going,
+        keep_going=keep_going, body_poses=body_poses,
     )  # fmt: skip
     raise typer.Exit(show_source(recording, options, json))
 
@@ -130,6 +136,7 @@ def tune(
     frame: _Frame = None,
     same_frame: _SameFrame = False,
     poses: _Poses = None,
+    body_poses: _BodyPoses = False,
     voxel: _Voxel = 0.1,
     keep_going: _KeepGoing = False,
     force: Annotated[bool, typer.Option(help="Replace the file.")] = False,
@@ -141,7 +148,7 @@ def tune(
 
     options = Options(
         camera, max_features, max_depth, tuple(topic or ()), frame, same_frame, poses, voxel,
-        keep_going,
+        keep_going, body_poses,
     )  # fmt: skip
     Tune(recordings, out, options, force, json).run()
 

@@ -37,6 +37,7 @@ from ..io.status import StatusServer, report
 from ..io.tls import tls_doubts
 from ..io.transport import Transport, load_zenoh
 from ..model import ConfigError, DagmapError
+from .inspect import tell_notes
 from .kernels import warm_up
 
 
@@ -140,7 +141,9 @@ class AgentCommand:
             return None
         camera = None if table.camera is None else settings.at(table.camera)
         poses = None if table.poses is None else settings.at(table.poses)
-        return open_source(settings.at(table.path), table.options(camera, poses))
+        source = open_source(settings.at(table.path), table.options(camera, poses))
+        tell_notes(source, self.console)
+        return source
 
     def _assemble(
         self, settings: Settings, log: Log, stack: ExitStack
@@ -188,11 +191,12 @@ def _inbox(config: AgentConfig) -> Inbox:
     """What comes in, within the configuration's limits."""
     network = config.network
     rates = Rates(
-        network.receive_messages_per_second,
-        network.receive_messages_per_second_per_robot,
-        network.receive_bytes_per_second_per_robot,
-        config.sync.chunk_bytes,
-        network.senders_remembered,
+        messages=network.receive_messages_per_second,
+        bytes=network.receive_bytes_per_second,
+        messages_of_one=network.receive_messages_per_second_per_robot,
+        bytes_of_one=network.receive_bytes_per_second_per_robot,
+        question=config.sync.chunk_bytes,
+        senders=network.senders_remembered,
     )
     most, of_one = network.receive_bytes, network.receive_bytes_per_robot
     return Inbox(most, of_one, rates, at_once=network.messages_per_step)

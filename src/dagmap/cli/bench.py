@@ -9,6 +9,7 @@ import importlib.util
 import json
 import platform
 import sys
+from itertools import groupby
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -58,16 +59,19 @@ def _load(path: Path) -> ModuleType:
 
 
 def _show(name: str, rows: list[dict[str, Any]]) -> None:
-    table = Table(title=name)
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    for column in columns:
-        table.add_column(column.replace("_", " "))
-    for row in rows:
-        table.add_row(*(_cell(row.get(column, "")) for column in columns))
-    Console().print(table)
+    """A table for those rows after each other that say the same things."""
+    for columns, alike in groupby(rows, key=tuple):
+        table = Table(title=name)
+        for column in columns:
+            table.add_column(column.replace("_", " "), overflow="fold")
+        for row in alike:
+            table.add_row(*(_cell(row[column]) for column in columns))
+        Console().print(table)
 
 
 def _cell(value: object) -> str:
     if isinstance(value, float):
         return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+    if value is None:
+        return ""
     return f"{value:,}" if isinstance(value, int) else str(value)

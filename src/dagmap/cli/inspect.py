@@ -23,6 +23,12 @@ def show_source(path: Path, options: Options, as_json: bool) -> int:
     return 0 if found.problem is None else 1
 
 
+def tell_notes(source: Source, console: Console) -> None:
+    """What was chosen of a recording, and what is only assumed of it."""
+    for note in getattr(source, "notes", ()):
+        console.print(f"{source.name}: {note}", soft_wrap=True, markup=False)
+
+
 def tell_skips(source: Source, console: Console) -> None:
     """What --keep-going has left out."""
     skips = getattr(source, "skips", None)

@@ -102,8 +102,9 @@ def revoke(
     done = f"{path}: {name} counts up to number {last}; give this file to any robot of the fleet"
     first = (
         f"{fleet} held {before} revocations before. First see that `dagmap status` of a robot "
-        f"shows no more transactions of the fleet key ({author}): where it does, {fleet} is an old copy; "
-        f"then put back the newest, and remove {path}: it would end the fleet key's say for good"
+        f"shows no more transactions of the fleet key ({author}): where it does, {fleet} is an "
+        f"old copy; then put back the newest, and remove {path}: it would end the fleet key's say "
+        "for good"
     )
     facts = {"file": str(path), "name": name, "last": last, "number": before, "author": author}
     _say([done, first], facts, as_json)

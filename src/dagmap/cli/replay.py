@@ -38,7 +38,7 @@ from ..sim.fleet import Fleet
 from ..sim.network import Link, Network
 from ..sim.robot import Happening, Robot
 from ..worldmap import WorldMap
-from .inspect import tell_skips
+from .inspect import tell_notes, tell_skips
 from .kernels import warm_up
 
 _LIBRARIES = ("numpy", "numba", "msgspec", "cryptography", "opencv-python-headless", "matplotlib")
@@ -106,8 +106,7 @@ class Replay:
                     f"{path}: another recording is called {source.name} too; rename one of them"
                 )
             sources[source.name] = source
-            for note in getattr(source, "notes", ()):
-                self.console.print(f"{source.name}: {note}", soft_wrap=True, markup=False)
+            tell_notes(source, self.console)
         return sources
 
     def _play(self, fleet: Fleet, sources: dict[str, Source]) -> None:

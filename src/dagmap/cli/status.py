@@ -36,6 +36,7 @@ def show_status(target: Path, as_json: bool) -> int:
         f"{'features wait to go out' if lag['to_issue'] else 'nothing waits to go out'}",
         soft_wrap=True,
     )
+    console.print(_overhead(answer["overhead"]), soft_wrap=True)
     for direction, kinds in answer["traffic"].items():
         if direction in ("sent", "received"):
             total = sum(row["bytes"] for row in kinds.values())
@@ -44,6 +45,23 @@ def show_status(target: Path, as_json: bool) -> int:
         console.print(f"not placed: {other['name']}, session {other['session']}: {other['why']}")
     console.print(_robots(answer))
     return 0
+
+
+def _overhead(found: dict[str, Any]) -> str:
+    """What DAGmap takes of the SLAM's cycle, and what is held back."""
+    if found["cycle_s"] is None:
+        return "overhead: no two cycles of the SLAM yet"
+    limits = [
+        f"{found[key]:,} {what}"
+        for key, what in (
+            ("features_sent_a_cycle", "features are sent a cycle at most"),
+            ("features_inserted_a_cycle", "features are inserted a cycle at most"),
+            ("bytes_per_second", "bytes are sent a second at most"),
+        )
+        if found[key] is not None
+    ]
+    share = f"{100 * found['load']:.1f} % of a cycle of {found['cycle_s']:.3g} s"
+    return "; ".join([f"overhead: {share}", f"N_c {found['n_c']}", *limits])
 
 
 def _robots(answer: dict[str, Any]) -> Table:

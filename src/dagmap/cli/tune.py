@@ -19,7 +19,7 @@ from ..io.export import atomic_write
 from ..io.sources import Options, open_source
 from ..model import DagmapError, OutputError
 from ..tuning import Measured, Proposed, gather, measure, proposal, propose
-from .inspect import tell_skips
+from .inspect import tell_notes, tell_skips
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +42,7 @@ class Tune:
         points, period = gather(named)
         console = Console(stderr=True)
         for source in sources:
+            tell_notes(source, console)
             tell_skips(source, console)
         measured = measure(points, period)
         proposed = propose(points, measured)

@@ -40,6 +40,7 @@ class Rates:
     """What may come in within a second; as much again may come at once, after silence."""
 
     messages: float = math.inf  # from all senders
+    bytes: float = math.inf
     messages_of_one: float = math.inf
     bytes_of_one: float = math.inf
     question: int = 0  # bytes that a question counts for: those of the answer that it may cause
@@ -70,7 +71,7 @@ class Throttle:
 
     def __init__(self, rates: Rates, clock: Callable[[], float]) -> None:
         self._rates, self._clock = rates, clock
-        self._all = _Bucket(rates.messages, math.inf, clock())
+        self._all = _Bucket(rates.messages, rates.bytes, clock())
         self._of_one: OrderedDict[AuthorId, _Bucket] = OrderedDict()
 
     def lets(self, sender: AuthorId, data: bytes) -> bool:
@@ -83,11 +84,12 @@ class Throttle:
         self._of_one.move_to_end(sender)
         if len(self._of_one) > rates.senders:
             self._of_one.popitem(last=False)
-        self._all.fill(rates.messages, math.inf, now)
+        self._all.fill(rates.messages, rates.bytes, now)
         one.fill(rates.messages_of_one, rates.bytes_of_one, now)
-        if self._all.messages < 1 or one.messages < 1 or one.bytes < size:
+        if min(self._all.messages, one.messages) < 1 or min(self._all.bytes, one.bytes) < size:
             return False
         self._all.messages -= 1
+        self._all.bytes -= size
         one.messages -= 1
         one.bytes -= size
         return True
@@ -138,6 +140,15 @@ class Inbox:
             self._messages.append(data)
             self._change.notify_all()
             return True
+
+    def put_back(self, messages: Iterable[bytes]) -> None:
+        """What was taken and not looked at is taken first again."""
+        with self._change:
+            for data in reversed(list(messages)):
+                size = len(data) + self.HELD
+                self._size += size
+                self._size_of[sender_of(data)] += size
+                self._messages.appendleft(data)
 
     def drop(self) -> None:
         """Count a message that never came this far."""

@@ -34,6 +34,7 @@ from .log import Log
 from .queues import Inbox, Question
 
 TICK = 0.05  # s between the ticks of an agent, where nothing comes in
+_READING = 0.03  # s after which no further message is read in a step
 _SOON = 0.02  # s from what came in to the tick that folds it, together with what comes meanwhile
 _STATE_PERIOD = 5.0  # s between two lines of the log that say how it stands
 _FETCH = 10  # retry periods that what others promise of the own chain gets to arrive
@@ -163,8 +164,7 @@ class Runtime:
         work = self.inbox.take(self._next_tick - time.monotonic())
         begun, used = time.monotonic_ns(), time.thread_time()
         events = [event for cycle in work.cycles for event in self._observe(cycle)]
-        for data in work.messages:
-            events += self.agent.receive(data, self.now)
+        read = self._read(work.messages, events)
         if time.monotonic() >= self._next_look:
             events += [event for data in self._brought() for event in self.agent.take(data)]
             self._next_look = time.monotonic() + _LOOK_PERIOD
@@ -181,11 +181,21 @@ class Runtime:
         self._trace(begun, events)
         out = self.agent.outbox()
         self.network.send(out)
-        if any(_is_news(data) for data in (*work.messages, *(each.data for each in out))):
+        if any(_is_news(data) for data in (*read, *(each.data for each in out))):
             self._last_news = self.now
         self._note(events)
         for question in work.questions:
             self._answer(question)
+
+    def _read(self, messages: list[bytes], events: list[Event]) -> list[bytes]:
+        """Hand in messages, and return which; what would take too long waits behind a cycle."""
+        until = time.monotonic() + _READING
+        for count, data in enumerate(messages, 1):
+            events += self.agent.receive(data, self.now)
+            if time.monotonic() >= until:
+                self.inbox.put_back(messages[count:])
+                return messages[:count]
+        return messages
 
     def _observe(self, cycle: Cycle) -> list[Event]:
         started, before = time.perf_counter(), self.agent.observing.observed

@@ -27,6 +27,7 @@ class SourceConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     max_features: int = 1000  # points that a frame of pictures gives at most
     camera: str | None = None  # a camera.json to use instead of the recording's own
     poses: str | None = None  # a file of poses: TUM, or KITTI beside clouds
+    body_poses: bool = False  # poses of a SLAM are the body's (IMU), not the camera's
     max_depth: float | None = None  # m, points beyond are dropped
     topics: tuple[str, ...] = ()  # of a bag; what is not named is found by its type
     frame: str | None = None  # of a bag with tf: the frame that stands still
@@ -46,6 +47,7 @@ class SourceConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             same_frame=self.same_frame,
             voxel=self.voxel,
             keep_going=self.keep_going,
+            body_poses=self.body_poses,
         )
 
 
@@ -79,6 +81,7 @@ class NetworkConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
     # From one robot, more than can be verified and folded (6 MB). A question counts for
     # `sync.chunk_bytes`: nobody makes a robot answer faster than that by asking and asking.
     receive_bytes_per_second_per_robot: int = 16 << 20
+    receive_bytes_per_second: int = 32 << 20  # from all robots: one may speak in many names
     # Whoever reaches the network can claim to be many: senders whose rate is remembered (the
     # oldest are forgotten), and robots in reach (nobody more is counted until somebody leaves).
     senders_remembered: int = 256
@@ -92,6 +95,7 @@ class NetworkConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
         self._require_range("receive_messages_per_second", 10, 1 << 32)
         self._require_range("receive_messages_per_second_per_robot", 10, 1 << 32)
         self._require_range("receive_bytes_per_second_per_robot", 1 << 16, 1 << 40)
+        self._require_range("receive_bytes_per_second", 1 << 16, 1 << 40)
         for name in ("senders_remembered", "robots_remembered", "messages_per_step"):
             self._require_range(name, 1, 1 << 20)
         self._require(
@@ -160,13 +164,14 @@ class AgentConfig(Config, frozen=True, kw_only=True, forbid_unknown_fields=True)
         super().__post_init__()
         if self.source is not None and self.ros is not None:
             raise ConfigError("[source] and [ros]: one robot has one SLAM; remove one of the two")
-        rate = self.network.receive_bytes_per_second_per_robot
         least = self.sync.chunk_bytes + (1 << 16)
-        if rate < least:  # no question would ever come through
-            raise ConfigError(
-                f"NetworkConfig: receive_bytes_per_second_per_robot = {rate}, but a question "
-                f"counts for an answer: at least sync.chunk_bytes + 65536 = {least} is wanted"
-            )
+        for name in ("receive_bytes_per_second_per_robot", "receive_bytes_per_second"):
+            rate = getattr(self.network, name)
+            if rate < least:  # no question would ever come through
+                raise ConfigError(
+                    f"NetworkConfig: {name} = {rate}, but a question "
+                    f"counts for an answer: at least sync.chunk_bytes + 65536 = {least} is wanted"
+                )
 
 
 @dataclass(frozen=True, slots=True)

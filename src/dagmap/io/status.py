@@ -48,6 +48,7 @@ def report(runtime: Runtime, transport: Transport) -> dict[str, object]:
             "to_issue": agent.holds_back,
             "unsent_bytes": transport.waiting_bytes,
         },
+        "overhead": _overhead(agent),
         "traffic": transport.traffic.table()
         | {"dropped": {"sent": transport.dropped, "received": runtime.inbox.dropped}},
         "refused": {reason.value: count for reason, count in runtime.counts.refused.items()},
@@ -60,6 +61,25 @@ def unplaced(agent: Agent) -> list[dict[str, object]]:
         {"author": f.author.hex(), "name": _name(agent, f.author), "session": f.session, "why": why}
         for f, why in sorted(agent.unplaced.items())
     ]
+
+
+def _overhead(agent: Agent) -> dict[str, object]:
+    """Section 5: what the last cycle took, what may be done (None: anything), what costs what."""
+    steering = agent.steering.controller
+    insert, send, merge = (1e6 * cost for cost in steering.model.costs.tolist())
+    return {
+        "cycle_s": steering.period,
+        "load": round(steering.load, 4),
+        "n_c": steering.n_c,
+        "features_sent_a_cycle": steering.n_f,
+        "features_inserted_a_cycle": steering.features,
+        "bytes_per_second": None if steering.rate is None else round(steering.rate),
+        "us_a_feature": {
+            "inserted": round(insert, 3),
+            "sent": round(send, 3),
+            "merged": round(merge, 3),
+        },
+    }
 
 
 def _heads(agent: Agent) -> dict[str, object]:

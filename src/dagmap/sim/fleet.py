@@ -16,9 +16,10 @@ from typing import TypeAlias
 
 import msgspec
 
-from ..agent import Agent, Parsers
+from ..agent import Agent
 from ..config import Config
 from ..identity import Identity
+from ..messages import Parsers
 from ..model import Accepted, AuthorId, ConfigError, Cycle, DagmapError, Event, Issued
 from ..transaction import id_of
 from .network import Link, Network

@@ -218,6 +218,15 @@ class ManyNamed(Noisy):
         return Outgoing(messages.encode(message, agent.config, self.random.randbytes(8)))
 
 
+class Promiser(Noisy):
+    """Promises in ever new names more of everybody's chain than there is, and never gives it."""
+
+    def noise(self, agent: Agent) -> Outgoing:
+        heads = tuple(Head(author, 1 << 39, bytes(8)) for author in agent.ledger.chains)
+        message = Heads(self.random.randrange(1 << 30), (), heads)
+        return Outgoing(messages.encode(message, agent.config, self.random.randbytes(8)))
+
+
 class WrongProver(Honest):
     """Spoils signatures and, where it is asked for, work, and speaks in the name of others."""
 
@@ -313,6 +322,7 @@ LIARS: dict[str, type[Honest]] = {
     "withholder": Withholder,
     "braggart": Braggart,
     "many-named": ManyNamed,
+    "promiser": Promiser,
 }
 
 

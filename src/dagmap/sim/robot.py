@@ -11,8 +11,9 @@ from typing import Literal, Protocol, TypeAlias
 import msgspec
 import numpy as np
 
-from ..agent import Agent, Parsers
+from ..agent import Agent
 from ..equations import Work
+from ..messages import Parsers
 from ..model import AuthorId, ConfigError, Cycle, Event, Outgoing, TransactionId
 
 Moment: TypeAlias = Literal["between", "unsynced", "unsent"]

@@ -9,8 +9,8 @@ from operator import attrgetter
 from typing import Generic, TypeVar
 
 from .. import messages, transaction
-from ..agent import Parsers
 from ..config import Config
+from ..messages import Parsers
 from ..transaction import Transaction
 from ..wire import Refusal
 

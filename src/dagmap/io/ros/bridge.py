@@ -101,6 +101,7 @@ class Bridge(Closing):
         self._feed = Feed(config, session)
         self._backlog = _Backlog(config.queue_bytes)
         self._unusable = 0
+        self._assumed = ""  # what the log was last told of what is assumed
         self._stopped = threading.Event()
         self._question: Question | None = None
         self._picture: telling.Picture | None = None
@@ -197,6 +198,10 @@ class Bridge(Closing):
             problem = self._said()[1] if begun else None
             if problem is not None:
                 self._log.seldom("warning", "no cycles", "feed", reason=problem)
+            if self._feed.assumed != self._assumed:
+                self._assumed = self._feed.assumed
+                if self._assumed:
+                    self._log.write("warning", "frame assumed", reason=self._assumed)
         if now >= self._next_tf:
             self._next_tf = now + self._config.tf_period
             self._tell_frame()
@@ -243,6 +248,8 @@ class Bridge(Closing):
             "messages dropped": self._backlog.dropped,
             **{f"{what} left out": count for what, count in sorted(feed.dropped.items())},
         }
+        if feed.assumed:
+            said["assumed"] = feed.assumed
         problem = feed.problem
         if problem is None and not np.isfinite(feed.newest):
             heard = ", ".join(topic.name for topic in wanted(self._config))

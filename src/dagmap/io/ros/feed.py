@@ -138,6 +138,11 @@ class Feed:
         return None if pose is None else (name, inverse(pose))
 
     @property
+    def assumed(self) -> str:
+        """What the poses of cycles were taken for without being told; empty where it was said."""
+        return self._poses.assumed if self._last > -np.inf else ""
+
+    @property
     def lost_frame(self) -> str:
         """The frame of the poses, where no tf leads from it to the one that is to be told of."""
         return "" if self.map_frame() is not None else self._pose_frame

@@ -12,11 +12,16 @@ from ._ros import Unusable, boundless
 from ._rtabmap_msgs import register
 from ._salvage import Cut, Record, mcap_records, ros1_records
 from ._source import Skips
+from ._unpacking import Swollen, bound_rosbags
 
 T = TypeVar("T")
 _REMEDY = (
     "copy it anew, or repair it (`ros2 bag reindex`, `rosbag reindex`, `mcap recover`); "
     "--keep-going reads what is whole"
+)
+_UNPACK = (
+    "if you trust it, unpack it with other tools (`mcap decompress`, `rosbag decompress`) and read "
+    "that; --keep-going reads what lies before"
 )
 
 
@@ -42,6 +47,7 @@ class Bag:
         self.path, self.skips = path, skips
         self._rosbags = _import(path, "rosbags.highlevel")
         self._typesys = _import(path, "rosbags.typesys")
+        bound_rosbags()
         self.ros2 = path.suffix != ".bag"
         self._salvaged = False
         index = path / "metadata.yaml" if path.is_dir() else path
@@ -50,7 +56,7 @@ class Bag:
         try:
             self.topics, self._types = self._look()
         except Exception as error:  # noqa: BLE001  whatever a foreign parser raises on such bytes
-            self._note(f"damaged, cut short, or of another version ({_first_line(error)})")
+            self._note("when it is opened", "damaged, cut short, or of another version", error)
             self._salvaged = True
             self.topics, self._types = self._look_at_records()
         if (name := boundless(self._types.fielddefs)) is not None:
@@ -77,7 +83,7 @@ class Bag:
         except RecordingError:
             raise
         except Exception as error:  # noqa: BLE001  see above
-            self._note(f"damaged after {count} messages ({_first_line(error)})")
+            self._note(f"after {count} messages", f"damaged after {count} messages", error)
 
     def read(self, message: Message, convert: Callable[[Any], T]) -> T:
         """What `convert` makes of the message with its fields as attributes.
@@ -101,8 +107,11 @@ class Bag:
             f"{self.path}: {message.topic}, message of {message.stamp:.6f} s: {what}"
         )
 
-    def _note(self, what: str) -> None:
-        self.skips.note(RecordingError(f"{self.path}: {what}; {_REMEDY}"))
+    def _note(self, where: str, what: str, error: Exception) -> None:
+        said = f"{what} ({_first_line(error)}); {_REMEDY}"
+        if isinstance(error, Swollen):
+            said = f"{where} {error}; {_UNPACK}"
+        self.skips.note(RecordingError(f"{self.path}: {said}"))
 
     def _open(self) -> Any:
         stores = self._typesys

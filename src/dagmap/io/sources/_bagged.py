@@ -14,9 +14,10 @@ from . import _ros as ros
 from ._bag import Bag, Message
 from ._cloud import thinned
 from ._kiss import KissIcp
+from ._lens import Distortion, is_rectified, lens_of
 from ._odometry import PictureOdometry
 from ._poses import SLACK, SensorPoses, nearest
-from ._rgbd import Camera, FrontEnd, import_cv2, load_camera
+from ._rgbd import Camera, FrontEnd, Straight, import_cv2, load_camera
 from ._source import Options, Skips, checked
 
 _STORED = 200  # pictures that wait for their partner at most
@@ -74,7 +75,7 @@ class CloudBag:
         rows = _Stamps(bag, topic, skips).rows
         self._poses: dict[int, Floats] | None = None
         if poses.known:
-            self.notes: tuple[str, ...] = (poses.check(rows[0][2]),)
+            self.notes: tuple[str, ...] = poses.notes(rows[0][2])
             self._poses = _placed(poses, rows)
             _require(bag.path, topic, len(rows), len(self._poses), poses.topic)
         else:
@@ -120,14 +121,19 @@ class RgbdBag:
         self.name, self.skips = _name(bag.path), skips
         self._bag, self._depth, self._color, self._options = bag, depth, color, options
         self._cv2 = import_cv2(bag.path)
-        self._camera = _camera(bag, camera, options)
+        self._camera, bent = _camera(bag, camera, is_rectified(color), options)
+        self._straight: Straight | None = None
+        if bent is not None:
+            self._straight = partial(bent.straight, self._cv2, self._camera)
         depths, colors = _Stamps(bag, depth, skips), _Stamps(bag, color, skips)
         self.notes: tuple[str, ...] = ("no poses in it: odometry by OpenCV",)
         placed: dict[int, Floats] | None = None
         if poses.known:
-            self.notes = (poses.check(depths.rows[0][2]),)
+            self.notes = poses.notes(depths.rows[0][2])
             placed = _placed(poses, depths.rows)
             _require(bag.path, depth, len(depths.rows), len(placed), poses.topic)
+        if bent is not None:
+            self.notes += (f"{color} is raw: its {bent.model} distortion is taken out",)
         partner = nearest(colors.stamps, depths.stamps)
         self._pairs: list[tuple[int, int, float, Floats | None]] = []
         for (number, stamp, _), i in zip(depths.rows, partner, strict=True):
@@ -145,8 +151,8 @@ class RgbdBag:
         return len(self._pairs)
 
     def __iter__(self) -> Iterator[Cycle]:
-        front = FrontEnd(self._cv2, self._camera, self._options)
-        odometry = PictureOdometry(self._cv2, self._camera)
+        front = FrontEnd(self._cv2, self._camera, self._options, self._straight)
+        odometry = PictureOdometry(self._cv2, self._camera, self._straight)
         for stamp, pose, depth, color in self._matched():
             try:
                 metres = self._bag.read(depth, partial(ros.depth_picture, self._cv2, depth.kind))
@@ -200,11 +206,13 @@ class RgbdBag:
             )
 
 
-def _camera(bag: Bag, topic: str, options: Options) -> Camera:
+def _camera(
+    bag: Bag, topic: str, rectified: bool, options: Options
+) -> tuple[Camera, Distortion | None]:
     if options.camera is not None:
-        return load_camera(options.camera)
+        return load_camera(options.camera), None
     for message in bag.messages({topic}):
-        return bag.read(message, _pinhole)
+        return bag.read(message, partial(lens_of, rectified=rectified))
     raise RecordingError(f"{bag.path}: {topic} holds no message; name a camera.json with --camera")
 
 
@@ -224,16 +232,3 @@ def _require(path: Path, topic: str, count: int, placed: int, poses: str) -> Non
 
 def _name(path: Path) -> str:
     return path.stem if path.is_file() else Path(path).resolve().name
-
-
-def _pinhole(info: Any) -> Camera:
-    """Of a CameraInfo, whose K is large in ROS 1. Raises Unusable."""
-    k = np.asarray(info.k if hasattr(info, "k") else info.K, np.float64).reshape(-1)
-    width, height = int(info.width), int(info.height)
-    if len(k) != 9 or not np.isfinite(k).all() or not (k[[0, 4]] > 0).all() or not width * height:
-        raise ros.Unusable(
-            f"the camera is not calibrated (K = {k.tolist()}); calibrate it, or name a camera.json "
-            "with --camera"
-        )
-    fx, fy, cx, cy = k[[0, 4, 2, 5]].tolist()
-    return Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, depth_scale=1000.0)

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...model import Floats, Uint8s
 from ._poses import inverse
-from ._rgbd import Camera
+from ._rgbd import Camera, Straight
 
 _FEATURES = 2000
 _LEAST = 25  # inliers without which it does not know where it is
@@ -21,10 +21,11 @@ class PictureOdometry:
     """Where the camera is, in the frame of the first picture of a session.
 
     Pictures in which it finds too little of the key frame start a session: a frame of its own.
+    straight: see `FrontEnd`.
     """
 
-    def __init__(self, cv2: Any, camera: Camera) -> None:
-        self._cv2, self._camera = cv2, camera
+    def __init__(self, cv2: Any, camera: Camera, straight: Straight | None = None) -> None:
+        self._cv2, self._camera, self._straight = cv2, camera, straight
         cv2.setRNGSeed(0)  # RANSAC draws
         self._orb = cv2.ORB_create(nfeatures=_FEATURES)
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
@@ -41,13 +42,24 @@ class PictureOdometry:
         gray = self._cv2.cvtColor(picture, self._cv2.COLOR_BGR2GRAY)
         found, descriptors = self._orb.detectAndCompute(gray, None)
         places = np.array([k.pt for k in found], np.float64).reshape(-1, 2)
+        places, pixels, descriptors = self._flattened(places, descriptors)
         inliers = self._find(places, descriptors)
         if inliers < _LEAST:
             self.session, self._guess = self.session + 1, np.eye(4)
         pose = inverse(self._guess)
         if inliers < _LEAST or self._key is None or inliers < _KEEP * len(self._key[0]):
-            self._take_key(pose, places, descriptors, metres)
+            self._take_key(pose, places, pixels, descriptors, metres)
         return pose
+
+    def _flattened(
+        self, seen: Floats, descriptors: Uint8s | None
+    ) -> tuple[Floats, Floats, Uint8s | None]:
+        """Places as the pinhole has them, as the picture has them, and what is there."""
+        if self._straight is None or descriptors is None:
+            return seen, seen, descriptors
+        places = self._straight(seen)
+        good = np.isfinite(places).all(axis=1)
+        return places[good], seen[good], np.ascontiguousarray(descriptors[good])
 
     def _find(self, places: Floats, descriptors: Uint8s | None) -> int:
         """Move the guess to where the key frame's points are seen; the number of inliers."""
@@ -77,13 +89,18 @@ class PictureOdometry:
         return len(rows)
 
     def _take_key(
-        self, pose: Floats, places: Floats, descriptors: Uint8s | None, metres: Floats
+        self,
+        pose: Floats,
+        places: Floats,
+        pixels: Floats,
+        descriptors: Uint8s | None,
+        metres: Floats,
     ) -> None:
         if descriptors is None:
             self._key = None
             return
         camera = self._camera
-        pixel = np.floor(places + 0.5).astype(np.int64)
+        pixel = np.floor(pixels + 0.5).astype(np.int64)
         pixel = np.clip(pixel, 0, (camera.width - 1, camera.height - 1))
         z = metres[pixel[:, 1], pixel[:, 0]]
         near = np.flatnonzero(np.isfinite(z) & (z > 0))

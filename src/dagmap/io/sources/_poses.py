@@ -221,6 +221,22 @@ class SensorPoses:
             )
         return f"poses by tf: {frame} in {self.fixed(frame)}"
 
+    def notes(self, frame: str) -> tuple[str, ...]:
+        """What `check` says, and what is only assumed of it. Raises RecordingError as that does."""
+        return tuple(said for said in (self.check(frame), self.assumed) if said)
+
+    @property
+    def assumed(self) -> str:
+        """That poses without the name of a frame count as the sensor's; empty where it is known."""
+        if not self.topic or self._same_frame or self._child or not len(self.trajectory):
+            return ""
+        return (
+            f"{self.topic} does not say what it is the pose of (no child_frame_id), and is taken "
+            "for the sensor's; if it is so, say --same-frame (same_frame = true in a robot's "
+            'file); if not, use tf (--topic /tf, or odometry = "" in [ros]) or an odometry that '
+            "names its child_frame_id"
+        )
+
     def at(self, stamp: float, frame: str) -> Floats | None:
         """(4, 4) of the sensor at a moment; None where it is not known."""
         if not self.topic:

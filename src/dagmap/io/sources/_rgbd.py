@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,9 @@ from ._source import Options, read_bytes
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
+
+# (N, 2) pixels of a picture -> where a pinhole sees the same, NaN for nowhere.
+Straight = Callable[[Floats], Floats]
 
 
 class Camera(msgspec.Struct, frozen=True, kw_only=True):
@@ -61,10 +65,14 @@ class FrontEnd:
 
     The same pictures give the same points in the same order: ORB has no randomness, what it finds
     is put in order here, and OpenCV's generator is seeded in case that ever changes.
+    straight: what takes the distortion out of places in raw pictures; None: there is none.
     """
 
-    def __init__(self, cv2: Any, camera: Camera, options: Options) -> None:
+    def __init__(
+        self, cv2: Any, camera: Camera, options: Options, straight: Straight | None = None
+    ) -> None:
         self._cv2, self._camera, self._options = cv2, camera, options
+        self._straight = straight
         cv2.setRNGSeed(0)
         self._orb = cv2.ORB_create(nfeatures=options.max_features)
 
@@ -85,6 +93,9 @@ class FrontEnd:
         z = metres[pixel[:, 1], pixel[:, 0]]
         most = self._options.max_depth
         valid = (z > 0) & (z <= (np.inf if most is None else most))
+        if self._straight is not None:
+            place = self._straight(place)
+            valid &= np.isfinite(place).all(axis=1)
         place, pixel, z = place[valid], pixel[valid], z[valid]
         x = (place[:, 0] - self._camera.cx) * z / self._camera.fx
         y = (place[:, 1] - self._camera.cy) * z / self._camera.fy

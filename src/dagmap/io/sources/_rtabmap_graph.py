@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ...model import Cycle, Floats, RecordingError
+from ...model import DESCRIPTOR, Cycle, Floats, RecordingError, Uint8s
 from ._poses import inverse, matrix
 from ._ros import LATEST, Unusable
 from ._source import Options, checked
+from .rtabmap import UINT8, unpack_rows
 
 _STILL = 5e-4  # m, and in a rotation: what moves less has not moved
 _FARTHEST = 5e5  # m from where the session began: what an agent takes
@@ -116,12 +118,13 @@ class GraphFollower:
         if not self._last < stamp < LATEST:
             self._skip(f"node {id_}: its stamp {stamp} does not come after {self._last}")
             return None
-        points = _chosen(node, self._options)
+        points, described = _chosen(node, self._options)
         if not len(points):
             return None  # a bare wall has no words
         pose = self.map @ pose
         try:
-            cycle = checked(Cycle(stamp, pose, points, session=self.session), f"node {id_}")
+            cycle = Cycle(stamp, pose, points, session=self.session, descriptors=described)
+            cycle = checked(cycle, f"node {id_}")
         except RecordingError as error:
             self._skip(str(error))
             return None
@@ -135,11 +138,7 @@ class GraphFollower:
             return cycles
         pairs = np.array(list(moved)), np.array(list(moved.values()))
         if cycles:
-            first = cycles[0]
-            cycles[0] = Cycle(
-                first.stamp, first.pose, first.points, moved=pairs, session=first.session
-            )
-            return cycles
+            return [replace(cycles[0], moved=pairs), *cycles[1:]]
         self._last += _AFTER
         latest = max(self._stamps, key=self._stamps.__getitem__)
         nothing = np.zeros((0, 3))
@@ -170,20 +169,36 @@ def _brought_over(old: dict[int, Floats], new: dict[int, Floats]) -> dict[int, F
     return {**{id_: shift @ pose for id_, pose in old.items()}, **new}
 
 
-def _chosen(node: Any, options: Options) -> Floats:
-    """(N, 3) m in the robot's frame: near enough, the strongest ones."""
+def _chosen(node: Any, options: Options) -> tuple[Floats, Uint8s | None]:
+    """(N, 3) m in the robot's frame: near enough, the strongest ones; and their (N, 32)
+    descriptors, where they have some of that size."""
+    packed = getattr(node, "word_descriptors", getattr(node, "wordDescriptors", b""))
     points, keys = _either(node, "word_pts", "wordPts"), _either(node, "word_kpts", "wordKpts")
     if not len(points) and hasattr(node, "data"):
         points, keys = node.data.points, node.data.key_points
+        packed = getattr(node.data, "descriptors", b"")
     places = np.array([(p.x, p.y, p.z) for p in points], np.float64).reshape(-1, 3)
+    order = np.arange(len(places))
     if len(keys) == len(places):
         strength = np.array([float(key.response) for key in keys])
-        places = places[np.argsort(-np.nan_to_num(strength), kind="stable")]
+        order = np.argsort(-np.nan_to_num(strength), kind="stable")
     most = np.inf if options.max_depth is None else options.max_depth
     with np.errstate(over="ignore", invalid="ignore"):
         distance = np.sqrt((places**2).sum(axis=1))
     near = (distance > 0) & (distance <= most) & np.isfinite(distance)
-    return np.asarray(places[near][: options.max_features])
+    rows = order[near[order]][: options.max_features]
+    described = _descriptors(packed, len(places))
+    return places[rows], None if described is None else described[rows]
+
+
+def _descriptors(packed: Any, count: int) -> Uint8s | None:
+    """(N, 32) of all words. None where they are of another size or kind, or damaged: the points
+    are good without them."""
+    try:
+        found = unpack_rows(bytes(packed), UINT8)
+    except (TypeError, ValueError):
+        return None
+    return found if count and found.shape == (count, DESCRIPTOR) else None
 
 
 def _either(message: Any, *names: str) -> Any:

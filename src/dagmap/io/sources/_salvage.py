@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import bz2
 import struct
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO, Any, NamedTuple
+
+from ._unpacking import Swollen, unpack_bz2, unpack_lz4, unpacked
 
 _MOST = 1 << 31  # bytes of a record
 _MAGIC = b"#ROSBAG V2.0\n"
@@ -50,9 +52,8 @@ def _ros1_chunk(
     if unpack is None:
         raise Cut(f"a chunk is packed by {name[:20]!r}")
     try:
-        size = min(int.from_bytes(header.get(b"size", b""), "little"), _MOST)
-        data = unpack(data, size)
-    except (OSError, EOFError, RuntimeError, ValueError, ImportError) as error:
+        data = unpack(data, int.from_bytes(header.get(b"size", b""), "little"))
+    except (OSError, EOFError, RuntimeError, ValueError, ImportError, Swollen) as error:
         raise Cut(f"a chunk cannot be unpacked ({error})") from None
     at = 0
     while at < len(data):
@@ -120,20 +121,11 @@ def _plain(data: bytes, size: int) -> bytes:
     return data
 
 
-def _unpack_bz2(data: bytes, size: int) -> bytes:
-    return bz2.BZ2Decompressor().decompress(data, max(size, 1))
-
-
-def _unpack_lz4(data: bytes, size: int) -> bytes:
-    unpacker = import_module("lz4.frame").LZ4FrameDecompressor()
-    return bytes(unpacker.decompress(data, max_length=max(size, 1)))
-
-
 # (bytes, how many they promise to become): no more than promised comes out.
 _ROS1_PACKED: dict[bytes, Callable[[bytes, int], bytes]] = {
     b"none": _plain,
-    b"bz2": _unpack_bz2,
-    b"lz4": _unpack_lz4,
+    b"bz2": unpack_bz2,
+    b"lz4": unpack_lz4,
 }
 
 
@@ -145,8 +137,8 @@ def mcap_records(path: Path) -> Iterator[Record]:
     topics: dict[int, tuple[str, int]] = {}
     with path.open("rb") as file:
         try:
-            reader = streams.StreamReader(file, record_size_limit=_MOST)
-            for record in reader.records:
+            reader = streams.StreamReader(file, record_size_limit=_MOST, emit_chunks=True)
+            for record in _in_chunks(reader.records, streams, kinds):
                 if isinstance(record, kinds.Schema):
                     schemas[record.id] = (record.name, record.data.decode("utf-8", "replace"))
                 elif isinstance(record, kinds.Channel):
@@ -158,3 +150,13 @@ def mcap_records(path: Path) -> Iterator[Record]:
                     )
         except Exception as error:  # noqa: BLE001  whatever a foreign parser raises on such bytes
             raise Cut(str(error) or type(error).__name__) from None
+
+
+def _in_chunks(found: Iterator[Any], streams: Any, kinds: Any) -> Iterator[Any]:
+    """Records, those in chunks too."""
+    for record in found:
+        if isinstance(record, kinds.Chunk):
+            plain = replace(record, compression="", data=unpacked(record))
+            yield from streams.breakup_chunk(plain)
+        else:
+            yield record

@@ -38,12 +38,15 @@ class Options:
     poses: Path | None = None  # a file of poses beside clouds
     voxel: float = 0.1  # m: of a cloud one point a voxel is kept
     keep_going: bool = False  # leave out what cannot be read, and say so in `skipped`
+    body_poses: bool = False  # poses of a SLAM are the body's (IMU), not the camera's
 
     def __post_init__(self) -> None:
         if not 1 <= self.max_features <= 1 << 20:
             raise ConfigError(f"max_features = {self.max_features}, but 1 to 2^20 is wanted")
         if self.max_depth is not None and not self.max_depth > 0:
             raise ConfigError(f"max_depth = {self.max_depth}, but more than 0 m is wanted")
+        if self.body_poses and self.same_frame:
+            raise ConfigError("body_poses and same_frame contradict each other; say one of them")
         if not 0.001 <= self.voxel <= 1000:
             raise ConfigError(f"voxel = {self.voxel}, but 0.001 to 1000 m is wanted")
 

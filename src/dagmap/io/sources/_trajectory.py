@@ -24,6 +24,23 @@ def numbers(file: Path, number: int, words: list[str], count: int) -> list[float
     return values
 
 
+def doubts(file: Path, same: bool) -> tuple[str, ...]:
+    """What is not known of whose poses a file holds, in words. same: that they are the camera's.
+
+    ORB-SLAM3 saves the poses of the body in its EuRoC format (ns) if it is inertial, else those of
+    the left camera, as always in TUM's (s).
+    """
+    if same or float(read_rows(file)[0][1][0]) <= _NANOSECONDS:
+        return ()
+    said = (
+        f"the stamps of {file.name} are in ns, as ORB-SLAM3 saves them for EuRoC: its poses are "
+        "taken for those of the left camera, but an inertial ORB-SLAM3 saves those of the body; "
+        "say --body-poses (body_poses = true in a robot's file) if it was inertial, --same-frame "
+        "if not"
+    )
+    return (said,)
+
+
 def read_tum(file: Path) -> Trajectory:
     """`stamp x y z qx qy qz qw` a line, the stamp in s, or in ns as ORB-SLAM3 writes it for EuRoC.
 

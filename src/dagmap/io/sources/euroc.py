@@ -14,12 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from ...model import Cycle, Floats, RecordingError, Uint8s
+from . import orbslam
 from ._odometry import PictureOdometry
 from ._poses import Trajectory, matrix, nearest
 from ._rgbd import FrontEnd, decode, import_cv2
 from ._source import Description, Item, Options, Skips, checked, folder_name, read_rows
 from ._stereo import Lens, Stereo, load_lens
-from ._trajectory import read_tum
+from ._trajectory import doubts, read_tum
 
 UNDERSTANDS = "an EuRoC folder (mav0/cam0, mav0/cam1, their sensor.yaml)"
 _TRUTH = "state_groundtruth_estimate0"
@@ -43,7 +44,10 @@ class _Pair:
 
 def matches(path: Path) -> bool:
     """Whether this is a folder with the cameras of such a recording, or one with them in mav0/."""
-    return path.is_dir() and _mav(path) is not None
+    mav = _mav(path) if path.is_dir() else None
+    if mav is None:
+        return False
+    return (mav / "cam0" / "data").is_dir() or not orbslam.matches(path)  # a map and its T_BS
 
 
 def open(path: Path, options: Options) -> EurocFolder:  # noqa: A001
@@ -82,8 +86,7 @@ class EurocFolder:
         self._stereo = Stereo(self._cv2, *lenses, self._mav)
         left, right = (_pictures(self._mav / name) for name in ("cam0", "cam1"))
         pairs = _paired(left, right, self._mav)
-        poses, note = self._poses(lenses[0])
-        self.notes: tuple[str, ...] = (note,)
+        poses, self.notes = self._poses(lenses[0])
         self._pairs = [_Pair(a, b, None) for a, b in pairs]
         if poses is not None:
             placed = ((a, b, poses.at(a.stamp / 1e9)) for a, b in pairs)
@@ -136,17 +139,22 @@ class EurocFolder:
             )
         return load_lens(file)
 
-    def _poses(self, lens: Lens) -> tuple[Trajectory | None, str]:
+    def _poses(self, lens: Lens) -> tuple[Trajectory | None, tuple[str, ...]]:
         """Poses by stamp, and what to tell of them; where what they track has the rectified camera
-        is then in `_in_tracked`: ground truth tracks the body, a file of a SLAM the left camera."""
+        is then in `_in_tracked`: ground truth tracks the body, and so does an inertial SLAM, others
+        track the left camera."""
         self._in_tracked = self._stereo.mounted
-        if self._options.poses is not None:
+        options, named = self._options, self._options.poses
+        if named is not None:
+            said = f"poses of {named}"
+            if options.body_poses:
+                return read_tum(named), (f"{said}, those of the body",)
             self._in_tracked = np.linalg.inv(lens.mounted) @ self._stereo.mounted
-            return read_tum(self._options.poses), f"poses of {self._options.poses}"
+            return read_tum(named), (said, *doubts(named, options.same_frame))
         file = self._mav / _TRUTH / "data.csv"
         if file.is_file():
-            return _truth(file), f"poses of {_TRUTH}"
-        return None, f"no {_TRUTH}: odometry by OpenCV"
+            return _truth(file), (f"poses of {_TRUTH}",)
+        return None, (f"no {_TRUTH}: odometry by OpenCV",)
 
     def _read(self, picture: _Picture, camera: int) -> Uint8s:
         found = decode(self._cv2, picture.file, self._cv2.IMREAD_COLOR)

@@ -14,7 +14,8 @@ import numpy.typing as npt
 
 from ...model import Cycle, Floats, RecordingError, Uint8s
 from ._source import Description, Item, Options, Skips, checked, folder_name, read_rows
-from ._trajectory import read_tum
+from ._stereo import load_lens
+from ._trajectory import doubts, read_tum
 from .scans import READERS
 
 UNDERSTANDS = (
@@ -22,6 +23,7 @@ UNDERSTANDS = (
 )
 _TRAJECTORIES = ("KeyFrameTrajectory.txt", "kf_*.txt")
 _POINTS = {"mappoints", "referencemappoints", "pointcloud"}
+_MOUNTED = ("mav0/cam0/sensor.yaml", "cam0/sensor.yaml", "sensor.yaml")  # EuRoC's, with T_BS
 _TEXTS = (".txt", ".csv", ".xyz")
 _CONE = np.cos(np.radians(50.0))  # half of a wide lens: what lies further aside was not seen
 _BLOCK = 1 << 21  # pairs of a point and a key frame at a time
@@ -60,6 +62,7 @@ class OrbSlamMap:
         self.name, self.files, self._options = folder_name(path), found, options
         self.skips = Skips(options.keep_going)
         self._stamps, self._poses = read_tum(found[0]).all()
+        whose = self._bring_to_camera(path)
         points, colors = self._read(found[1])
         seen = np.isfinite(points).all(axis=1)
         self._points, self._colors = points[seen], None if colors is None else colors[seen]
@@ -68,7 +71,7 @@ class OrbSlamMap:
             raise RecordingError(f"{found[1]}: no points; save the map after it has been built")
         self._owner = _owners(self._points, self._poses, options)
         self.dropped = int((self._owner == _NOBODY).sum()) + int((~seen).sum())
-        self.notes = (f"{self.dropped} of {self.count} points before no key frame",)
+        self.notes = (f"{self.dropped} of {self.count} points before no key frame", *whose)
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -88,6 +91,20 @@ class OrbSlamMap:
                 self.skips.note(error)
                 continue
             yield cycle
+
+    def _bring_to_camera(self, path: Path) -> tuple[str, ...]:
+        """Poses of the body become those of the left camera; what to tell of them."""
+        if not self._options.body_poses:
+            return doubts(self.files[0], self._options.same_frame)
+        places = [path / name for name in _MOUNTED]
+        file = next((place for place in places if place.is_file()), None)
+        if file is None:
+            raise RecordingError(
+                f"{places[0]}: missing; poses of the body (--body-poses) are brought to the camera "
+                "by its T_BS, so copy EuRoC's sensor.yaml of cam0 to there"
+            )
+        self._poses = self._poses @ load_lens(file).mounted
+        return (f"poses of the body, brought to the camera by {file}",)
 
     def _read(self, file: Path) -> tuple[Floats, Uint8s | None]:
         if file.suffix.lower() in READERS:

@@ -25,7 +25,12 @@ _NODES = "SELECT id, map_id, stamp, pose FROM Node WHERE id > 0 ORDER BY id"
 _FEATURES = """SELECT depth_x, depth_y, depth_z FROM Feature WHERE node_id = ?
     AND depth_x IS NOT NULL ORDER BY response DESC, rowid LIMIT ?"""
 _COUNT = "SELECT count(*) FROM Feature WHERE depth_x IS NOT NULL"
-_INT32, _FLOAT32 = 4, 5  # OpenCV's types, one channel
+UINT8, _INT32, _FLOAT32 = 0, 4, 5  # OpenCV's types, one channel
+_TYPES: dict[int, np.dtype[Any]] = {
+    UINT8: np.dtype("u1"),
+    _INT32: np.dtype("<i4"),
+    _FLOAT32: np.dtype("<f4"),
+}
 _AFTER = 1e-3  # s after the last node: when a mere correction is dated
 _MOST_SMALLER = 1100  # zlib makes nothing smaller than by this factor
 _MAGIC = b"SQLite format 3\0"
@@ -194,11 +199,19 @@ def _moves(nodes: list[_Node]) -> tuple[Floats, Floats] | None:
 
 
 def unpack_matrix(blob: bytes, kind: int) -> np.ndarray:
-    """The numbers of an OpenCV matrix: zlib, then rows, columns and type. Raises ValueError."""
+    """The numbers of an OpenCV matrix, row by row. Raises ValueError."""
+    return unpack_rows(blob, kind).ravel()
+
+
+def unpack_rows(blob: bytes, kind: int) -> np.ndarray:
+    """An OpenCV matrix as RTAB-Map packs it: zlib, then rows, columns and type. Raises ValueError.
+
+    kind: the type that is wanted, `UINT8` or another key of `_TYPES`.
+    """
     if len(blob) < 12:
         raise ValueError(f"{len(blob)} bytes")
     rows, columns, found = struct.unpack("<iii", blob[-12:])
-    size = rows * columns * 4
+    size = rows * columns * _TYPES[kind].itemsize
     if found != kind or min(rows, columns) < 0 or size > _MOST_SMALLER * len(blob):
         raise ValueError(f"{rows} x {columns} of type {found} in {len(blob)} bytes")
     unpacker = zlib.decompressobj()
@@ -208,7 +221,7 @@ def unpack_matrix(blob: bytes, kind: int) -> np.ndarray:
         raise ValueError(str(error)) from None
     if len(data) != size:
         raise ValueError(f"{size} bytes are promised, {len(data)} are there")
-    return np.frombuffer(data, "<i4" if kind == _INT32 else "<f4")
+    return np.frombuffer(data, _TYPES[kind]).reshape(rows, columns)
 
 
 def _pose(blob: Any) -> Floats | None:

@@ -16,10 +16,10 @@ from pathlib import Path
 import msgspec
 
 from ... import messages
-from ...agent import Agent, Parsers
+from ...agent import Agent
 from ...config import Config
 from ...identity import Identity
-from ...messages import Head, Heads, Message
+from ...messages import Head, Heads, Message, Parsers
 from ...model import AuthorId, DagmapError, Reason, TransactionId
 from ...worldmap import WorldMap
 from .. import keys

@@ -1,0 +1,179 @@
+"""Chunks that claim, or become, far more than their few kilobytes: named, and not unpacked."""
+
+from __future__ import annotations
+
+import bz2
+import json
+import struct
+import subprocess
+import sys
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import lz4.frame
+import pytest
+import zstandard
+from mcap import records
+from mcap.data_stream import RecordBuilder
+
+from bags import Make, write_bag
+from dagmap.io.sources import Options, open_source
+from dagmap.io.sources._unpacking import MOST, Swollen, bound_rosbags, unpack_bz2, unpack_lz4
+from dagmap.model import RecordingError
+from test_bags import lidar
+
+HUGE = 1 << 30
+MAGIC = b"\x89MCAP0\r\n"
+
+
+def packed(kind: str, size: int) -> bytes:
+    """So many zeros, made piece by piece; whole messages before them."""
+    head = struct.pack("<BQHIQQ", 5, size - 9, 1, 0, 10**9, 10**9)
+    out, piece = BytesIO(), bytes(1 << 20)
+    writer: Any = (
+        zstandard.ZstdCompressor().stream_writer(out, closefd=False)
+        if kind == "zstd"
+        else lz4.frame.LZ4FrameFile(out, "wb")
+    )
+    with writer:
+        writer.write(head + bytes(len(piece) - len(head)))
+        for _ in range(size // len(piece) - 1):
+            writer.write(piece)
+    return out.getvalue()
+
+
+def mcap(path: Path, kind: str, claimed: int, size: int, indexed: bool) -> Path:
+    """A file with one such chunk; without an index, rosbags looks into the chunk at once."""
+    build = RecordBuilder()
+
+    def at() -> int:
+        return len(MAGIC) + build.count
+
+    records.Header(profile="ros2", library="").write(build)
+    begin = at()
+    records.Chunk(
+        compression=kind, data=packed(kind, size), message_start_time=0,
+        message_end_time=2 * 10**9, uncompressed_crc=0, uncompressed_size=claimed,
+    ).write(build)  # fmt: skip
+    length = at() - begin
+    records.DataEnd(data_section_crc=0).write(build)
+    summary = at() if indexed else 0
+    if indexed:
+        definition = b"std_msgs/Header header"
+        records.Schema(
+            id=1, name="sensor_msgs/msg/PointCloud2", encoding="ros2msg", data=definition
+        ).write(build)
+        records.Channel(
+            id=1, topic="/points", message_encoding="cdr", metadata={}, schema_id=1
+        ).write(build)
+        records.ChunkIndex(
+            chunk_length=length, chunk_start_offset=begin, compression=kind,
+            compressed_size=length - 49 - len(kind), message_end_time=2 * 10**9,
+            message_index_length=31, message_index_offsets={1: begin + length},
+            message_start_time=0, uncompressed_size=claimed,
+        ).write(build)  # fmt: skip
+        records.Statistics(
+            attachment_count=0, channel_count=1, channel_message_counts={1: 1}, chunk_count=1,
+            message_count=1, message_end_time=2 * 10**9, message_start_time=0, metadata_count=0,
+            schema_count=1,
+        ).write(build)  # fmt: skip
+    records.Footer(summary_start=summary, summary_offset_start=0, summary_crc=0).write(build)
+    path.write_bytes(MAGIC + build.end() + MAGIC)
+    return path
+
+
+OPEN = """
+import json, sys
+from pathlib import Path
+from dagmap.io.sources import Options, open_source
+from dagmap.model import RecordingError
+import rosbags.highlevel, mcap.stream_reader, zstandard, lz4.frame, dagmap.io.sources._kiss
+
+def peak():
+    line = next(l for l in open("/proc/self/status") if l.startswith("VmHWM"))
+    return int(line.split()[1]) * 1024
+
+before = peak()
+said = ""
+try:
+    list(open_source(Path(sys.argv[1]), Options(keep_going=sys.argv[2] == "1")))
+except RecordingError as error:
+    said = str(error)
+print(json.dumps([said, peak() - before]))
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the peak is Linux's")
+@pytest.mark.parametrize("indexed", [True, False])
+@pytest.mark.parametrize(
+    ("kind", "claimed", "size"),
+    [("zstd", HUGE, HUGE), ("zstd", 4096, HUGE), ("lz4", 4096, HUGE // 4), ("zstd", 1 << 62, HUGE)],
+)
+def test_a_chunk_that_swells_takes_no_memory(
+    tmp_path: Path, indexed: bool, kind: str, claimed: int, size: int
+) -> None:
+    path = mcap(tmp_path / "walk.mcap", kind, claimed, size, indexed)
+    assert path.stat().st_size < 2 << 20
+    for keep_going in "01":
+        command = [sys.executable, "-c", OPEN, str(path), keep_going]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+        assert done.returncode == 0, done.stderr
+        said, taken = json.loads(done.stdout)
+        assert said.startswith(f"{path}: ") and "\n" not in said
+        if keep_going == "0":
+            assert f"a packed chunk {'claims' if claimed > MOST else 'becomes more than'}" in said
+            assert f"walk.mcap: {'after 0 messages' if indexed else 'when it is opened'}" in said
+            assert "mcap decompress" in said and "damaged" not in said
+        assert taken < 64 << 20
+
+
+def test_chunks_of_ros_1_are_bounded_too() -> None:
+    bound_rosbags()
+    from rosbags.rosbag1 import reader
+
+    for kind, pack in (("bz2", bz2.compress), ("lz4", lz4.frame.compress)):
+        assert reader.decompressors[kind](pack(b"walk")) == b"walk"
+        with pytest.raises(Swollen, match="becomes more than the"):
+            reader.decompressors[kind](pack(bytes(MOST + 1)))
+        for size in (4, 5):
+            assert reader.decompressors[kind](pack(b"walk"), size) == b"walk"
+        for end in (1, 4):
+            with pytest.raises(ValueError, match="cut short"):
+                reader.decompressors[kind](pack(bytes(100_000))[:-end])
+    with pytest.raises(Swollen, match="than the 3 bytes"):
+        unpack_bz2(bz2.compress(b"walk"), 3)
+    with pytest.raises(Swollen, match=f"claims {MOST + 1} bytes"):
+        unpack_lz4(b"", MOST + 1)
+
+
+@pytest.mark.parametrize("kind", ["zstd", "lz4"])
+@pytest.mark.parametrize("end", [0, 100])
+def test_packed_chunks_that_keep_their_promise_are_read(
+    tmp_path: Path, kind: str, end: int
+) -> None:
+    """Also without their end, record by record."""
+    from mcap.reader import make_reader
+    from mcap.writer import CompressionType, Writer
+
+    make = Make()
+    plain = write_bag(tmp_path / "plain.mcap", make, lidar(make))
+    path = tmp_path / "walk.mcap"
+    with plain.open("rb") as source, path.open("wb") as sink:
+        writer = Writer(sink, chunk_size=1 << 14, compression=CompressionType[kind.upper()])
+        writer.start(profile="ros2")
+        known: dict[str, int] = {}
+        for schema, channel, message in make_reader(source).iter_messages():
+            assert schema is not None
+            if channel.topic not in known:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                known[channel.topic] = writer.register_channel(channel.topic, "cdr", number)
+            writer.add_message(
+                known[channel.topic], message.log_time, message.data, message.publish_time
+            )
+        writer.finish()
+    if end:
+        path.write_bytes(path.read_bytes()[:-end])
+        with pytest.raises(RecordingError, match="damaged, cut short"):
+            open_source(path)
+    assert len(list(open_source(path, Options(keep_going=bool(end))))) == 5
