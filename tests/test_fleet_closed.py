@@ -137,6 +137,9 @@ class TestStrangers:
         expired = make_leaf(key, "office", robot.identity.public_key, "late", (), days=-1)
         (late.keys / "tls.pem").write_bytes(expired)
         assert self.kept_out(a, b, late)
+        told = [line for line in late.log.splitlines() if 'event="tls certificate"' in line]
+        assert len(told) == 1 and f"file={late.keys}/tls.pem" in told[0], late.log
+        assert "it expired 20" in told[0] and "dagmap keys renew late" in told[0]
         with running(a, b, late):  # what it wrote meanwhile counts, once its certificate holds
             for one in (a, b):
                 one.start("--speed", 50)

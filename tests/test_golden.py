@@ -39,7 +39,9 @@ from dagmap.payload import (
     decode_payload,
     encode_payload,
 )
+from dagmap.text import printable
 from dagmap.transaction import id_of, parse, seal
+from dagmap.wire import Refusal
 
 WORKED = Config()  # with the default proof of work
 CLOSED = closed()
@@ -109,6 +111,40 @@ def test_records(kind: Kind) -> None:
     data = bytes.fromhex(RECORDS[kind])
     assert encode_payload(PAYLOADS[kind]).hex() == data.hex()
     assert data[0] == kind and encode_payload(decode_payload(data, 2)) == data
+
+
+# First and last code point of what no name may hold; every plane ends with two more.
+NOT_IN_NAMES = (
+    "0000-001f 007f-009f 061c-061c 200e-200f 2028-2029 202a-202e 2066-2069 d800-dfff fdd0-fdef "
+    "feff-feff"
+)
+
+
+def test_names_hold_what_the_protocol_says_whatever_the_python() -> None:
+    refused = [number for number in range(0x110000) if not printable(f"a{chr(number)}b")]
+    ranges = [[int(end, 16) for end in pair.split("-")] for pair in NOT_IN_NAMES.split()]
+    ranges += [[plane + 0xFFFE, plane + 0xFFFF] for plane in range(0, 0x110000, 0x10000)]
+    assert refused == sorted(n for first, last in ranges for n in range(first, last + 1))
+
+
+@pytest.mark.parametrize("edge", NOT_IN_NAMES.replace("d800-dfff ", "").split())
+def test_names_at_the_edges(edge: str) -> None:
+    """Also of robots: characters that Unicode has had since Python 3.10, and those of nobody."""
+    first, last = (int(end, 16) for end in edge.split("-"))
+    for letter in (chr(first), chr(last)):
+        for payload in (Payload(name=letter), Payload(certificate=letter.encode() + bytes(64))):
+            with pytest.raises(Refusal, match="characters that none may have"):
+                decode_payload(encode_payload(payload), 2)
+    for letter in (chr(max(first, 1) - 1), chr(last + 1), "\U0001fae8", "\u0378", "\ue000", "\xa0"):
+        if printable(letter):
+            assert decode_payload(encode_payload(Payload(name=letter)), 2).name == letter
+
+
+def test_names_are_well_formed() -> None:
+    for data in (b"\xed\xa0\x80", b"\xc0\xaf", b"\xf4\x90\x80\x80", b"\xff", b"a" * 65):
+        with pytest.raises(Refusal):
+            decode_payload(bytes([Kind.PROFILE, len(data)]) + data, 2)
+    assert decode_payload(bytes([Kind.PROFILE, 0]), 2).name == ""
 
 
 def test_ids() -> None:

@@ -112,7 +112,8 @@ def test_private_keys_are_private_from_the_start(
         create_fleet(tmp_path / "f", "f").enroll("r", tmp_path / "r", 30)
     finally:
         os.umask(before)
-    assert opened[".fleet.key.part"] == opened[".robot.key.part"] == 0o600
+    parts = [f".{name}.key.{os.getpid()}.part" for name in ("fleet", "robot")]
+    assert [opened[part] for part in parts] == [0o600, 0o600]
     assert mode(tmp_path / "f" / "fleet.key") == mode(tmp_path / "r" / "robot.key") == 0o600
     assert mode(tmp_path / "f") == mode(tmp_path / "r") == 0o700
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".")]
@@ -198,6 +199,49 @@ def test_a_revocation_is_only_followed_by_a_stricter_one(fleet: Fleet) -> None:
         with pytest.raises(KeysError, match="robot1 is revoked from number 5 on already"):
             fleet.revoke("robot1", last)
     assert fleet.revoke("robot1", 3).name == "0001.tx"
+
+
+def test_what_a_killed_command_left_blocks_no_later_one(
+    fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in (os.getpid(), os.getpid() + 1):
+        (fleet.folder / "revocations" / f".0000.tx.{number}.part").write_bytes(b"half")
+    (fleet.folder / "revocations" / ".0000.tx.part").write_bytes(b"half")  # of an earlier release
+    assert fleet.revoke("robot1", 4).name == "0000.tx"
+    assert len(fleet.revocations()) == 1
+
+
+@pytest.mark.parametrize("call", ["replace", "link"])
+def test_an_enrolment_that_is_cut_short_burns_no_name(
+    fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
+) -> None:
+    """Before its folder is in place, and between that and the list of robots."""
+    real = getattr(os, call)
+
+    def cut(source: Path, target: Path) -> None:
+        if target.name in ("robot2", "robot2.json"):
+            raise KeyboardInterrupt
+        real(source, target)
+
+    monkeypatch.setattr(os, call, cut)
+    with pytest.raises(KeyboardInterrupt):
+        fleet.enroll("robot2", tmp_path / "robot2", 30)
+    monkeypatch.undo()
+    made = (tmp_path / "robot2" / "robot.key").exists()
+    assert made == (call == "link") and list(fleet.robots()) == ["robot1"]
+    enrolled = fleet.enroll("robot2", tmp_path / "robot2", 30)
+    robot = open_robot(tmp_path / "robot2")
+    assert fleet.robots()["robot2"] == enrolled and robot.identity.author == enrolled.author
+    with pytest.raises(KeysError, match="exists and is not empty"):
+        fleet.enroll("robot3", tmp_path / "robot2", 30)  # it is another's
+
+
+def test_revoking_says_how_many_there_were(fleet: Fleet) -> None:
+    """From an old copy of the folder a second 0000.tx would fork the fleet key."""
+    for before in (0, 1):
+        done = keys("revoke", "robot1", "--last", 4 - before, "--fleet", fleet.folder)
+        assert f"held {before} revocations before. First see that `dagmap status`" in done.output
+        assert fleet.identity.author.hex() in done.output
 
 
 def test_folders_that_are_damaged_or_mixed_up(fleet: Fleet, tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from dagmap import Config
+from dagmap.io import metrics
 from dagmap.io.log import Log
 from dagmap.io.metrics import MetricsServer
 from dagmap.io.queues import Inbox
@@ -211,6 +212,25 @@ class TestMetrics:
         )
         assert "Traceback" not in capfd.readouterr().err
 
+    def test_a_byte_now_and_then_holds_no_place(
+        self, opened: ExitStack, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(metrics, "_PATIENCE", 0.3)
+        server = opened.enter_context(MetricsServer(("127.0.0.1", 0), *self.robot(opened), 1))
+        slow = opened.enter_context(socket.create_connection(server.address, 10))
+        slow.sendall(b"GET /")
+
+        def hung_up() -> bool:
+            try:
+                slow.sendall(b"x")
+            except ConnectionError:
+                return True
+            return _hung_up(slow)
+
+        until(hung_up)
+        address = f"http://127.0.0.1:{server.address[1]}/metrics"
+        until(lambda: "dagmap_cycles_total" in _try(address))
+
     @pytest.mark.skipif(not socket.has_ipv6, reason="there is no IPv6 on this machine")
     def test_addresses_of_ipv6(self, opened: ExitStack) -> None:
         server = opened.enter_context(MetricsServer(("::1", 0), *self.robot(opened)))
@@ -257,6 +277,7 @@ class Authority:
                 serialization.NoEncryption(),
             )
         )
+        paths["key"].chmod(0o600)
         return TlsConfig(
             ca=str(self.folder / "ca.pem"), certificate=str(paths["pem"]), key=str(paths["key"])
         )

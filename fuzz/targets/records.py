@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from random import Random
 
 from dagmap.payload import decode_payload, encode_payload, first_certificate
+from dagmap.text import printable
 from dagmap.wire import Refusal
 from grammar import Flip
 from targets import Target
@@ -19,7 +20,7 @@ def run(data: bytes) -> bool:
     except Refusal:
         return False
     assert first in (None, found.certificate), "the certificate that was looked for is another"
-    assert found.robot is None or found.robot.isprintable()
+    assert found.robot is None or printable(found.robot)
     once = encode_payload(found)
     again = encode_payload(decode_payload(once, CONFIG.graph.n_p))
     assert once == again and len(once) <= len(data), "encoding does not give what was read"

@@ -23,6 +23,7 @@ from .model import (
     CycleError,
     quantise_pose,
 )
+from .text import printable
 
 
 class _Checked(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -285,7 +286,7 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         fits = len(self.name.encode()) <= MAX_NAME
         self._require(fits, "name", f"at most {MAX_NAME} bytes of UTF-8 are wanted")
-        self._require(self.name.isprintable(), "name", "printable characters are wanted")
+        self._require(printable(self.name), "name", "printable characters are wanted")
         self._require(
             not self.fleet_key or re.fullmatch("[0-9a-f]{64}", self.fleet_key) is not None,
             "fleet_key",

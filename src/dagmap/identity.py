@@ -1,7 +1,7 @@
 """Who signs: an Ed25519 key, the 8-byte author id that follows from it, and in a closed fleet the
 certificate with which the fleet key vouches for it.
 
-    certificate: name of the robot (1 to 64 bytes of printable UTF-8) | Ed25519 signature 64,
+    certificate: name of the robot (1 to 64 bytes of UTF-8, see text.py) | Ed25519 signature 64,
     the fleet key's over "dagmap certificate 1\\0" | fleet id 8 | public key of the robot 32 | name
 
 It is a record of its own and no X.509, so that what is accepted depends on no library's parser, and
@@ -21,6 +21,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import (
 
 from .config import Config
 from .model import MAX_NAME, AuthorId, ConfigError
+from .text import printable
 
 _CERTIFIED = b"dagmap certificate 1\0"
 
@@ -68,7 +69,7 @@ class Identity:
         Raises ValueError where the name is not 1 to 64 bytes of printable UTF-8.
         """
         encoded = name.encode()
-        if not 0 < len(encoded) <= MAX_NAME or not name.isprintable():
+        if not 0 < len(encoded) <= MAX_NAME or not printable(name):
             raise ValueError(f"name {name!r}: 1 to 64 bytes of printable UTF-8 are wanted")
         return encoded + self.sign(_CERTIFIED + fleet_id + public_key + encoded)
 

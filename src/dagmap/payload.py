@@ -27,6 +27,7 @@ from .model import (
     Reason,
     Uint8s,
 )
+from .text import printable
 from .wire import Reader, Refusal
 
 MAX_FEATURES = 4096  # of one bundle record; bounds the work that foreign bytes can ask for
@@ -35,7 +36,7 @@ MAX_SEQUENCE = (1 << 40) - 1  # of an author's transactions
 CERTAIN = (1 << 31) - 1  # inliers of a link that was configured, not measured
 _MAX_LIST = 1 << 16
 _DESCRIBED = np.dtype([("position", "<i4", 3), ("descriptor", "u1", DESCRIPTOR)])
-_NORM_SLACK = 1 << 50  # of a quaternion's squared norm 2^60: a thousandth
+_NORM_SLACK = 1 << 50  # of a quaternion's squared norm 2^60: a 1024th
 
 
 class Kind(IntEnum):
@@ -234,8 +235,8 @@ def _decode_name(body: Reader) -> str:
         name = body.take(body.left).decode()
     except UnicodeDecodeError:
         raise Refusal(Reason.MALFORMED, "name is not UTF-8") from None
-    if not name.isprintable():
-        raise Refusal(Reason.MALFORMED, "name has unprintable characters")
+    if not printable(name):
+        raise Refusal(Reason.MALFORMED, "name has characters that none may have")
     return name
 
 

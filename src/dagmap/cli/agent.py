@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -33,6 +34,7 @@ from ..io.runtime import Runtime, Slam
 from ..io.settings import AgentConfig, Settings, load_settings
 from ..io.sources import Source, open_source
 from ..io.status import StatusServer, report
+from ..io.tls import tls_doubts
 from ..io.transport import Transport, load_zenoh
 from ..model import ConfigError, DagmapError
 from .inspect import tell_notes
@@ -64,14 +66,19 @@ class AgentCommand:
             raise DagmapError(f"--until-agreed {self.until_agreed}: seconds, 0 or more, are wanted")
         settings = self._settings()
         load_zenoh()
+        doubts = _doubts(settings)
         source = self._open_source(settings)
         if settings.config.ros is not None and self.link is None:
             Types(ros2=True)  # says what is not installed
         warm_up(self.console)
         if self.check:
+            for file, why in doubts:
+                self.console.print(f"{file}: {why}", soft_wrap=True)
             self.console.print(f"{self.config_file}: all right")
             return 0
         log = Log(sys.stderr, self.level)
+        for file, why in doubts:
+            log.write("warning", "tls certificate", file=file, meaning=why)
         with ExitStack() as stack:
             runtime, transport = self._assemble(settings, log, stack)
             gc.collect()
@@ -172,6 +179,12 @@ class AgentCommand:
             transient=True,
             disable=not (total and self.console.is_terminal),
         )
+
+
+def _doubts(settings: Settings) -> list[tuple[Path, str]]:
+    """What is wrong with the certificate for TLS. Raises NetworkError where it cannot be used."""
+    tls = settings.config.network.tls
+    return [] if tls is None else tls_doubts(tls, settings.folder, datetime.now(timezone.utc))
 
 
 def _inbox(config: AgentConfig) -> Inbox:

@@ -96,9 +96,18 @@ def revoke(
     """Sign that a robot counts no further. Give the file to any robot: it spreads by itself."""
     from ..io.keys import open_fleet
 
-    path = open_fleet(fleet).revoke(name, last)
-    lines = [f"{path}: {name} counts up to number {last}; give this file to any robot of the fleet"]
-    _say(lines, {"file": str(path), "name": name, "last": last}, as_json)
+    home = open_fleet(fleet)
+    path, author = home.revoke(name, last), home.identity.author.hex()
+    before = int(path.stem)
+    done = f"{path}: {name} counts up to number {last}; give this file to any robot of the fleet"
+    first = (
+        f"{fleet} held {before} revocations before. First see that `dagmap status` of a robot "
+        f"shows no more transactions of the fleet key ({author}): where it does, {fleet} is an "
+        f"old copy; then put back the newest, and remove {path}: it would end the fleet key's say "
+        "for good"
+    )
+    facts = {"file": str(path), "name": name, "last": last, "number": before, "author": author}
+    _say([done, first], facts, as_json)
 
 
 @app.command()

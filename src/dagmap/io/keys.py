@@ -34,6 +34,7 @@ from ..config import Config, load_config
 from ..identity import Identity, author_of, certificate_holds
 from ..model import MAX_NAME, AuthorId, ConfigError, KeysError
 from ..payload import MAX_SEQUENCE, Payload, Revocation
+from ..text import printable
 from ..transaction import Transaction, parse, seal
 from ..wire import Refusal
 from .certificates import make_authority, make_leaf, valid_until
@@ -92,7 +93,11 @@ class Fleet:
         return found
 
     def enroll(self, name: str, out: Path, days: int, addresses: Sequence[str] = ()) -> Enrolled:
-        """Make a robot's folder `out`: its key, the fleet's certificate for it, TLS for `days`."""
+        """Make a robot's folder `out`: its key, the fleet's certificate for it, TLS for `days`.
+
+        A folder that is there but not on the fleet's list, since something ended the command
+        before that was written, is put on it as it is.
+        """
         if _FILE_NAME.fullmatch(name) is None:
             raise KeysError(
                 f"name {name!r}: 1 to 63 letters, digits, dots, dashes and underscores are wanted, "
@@ -103,10 +108,12 @@ class Fleet:
                 f"{self.folder}: {name} is enrolled already; take another name, or renew its TLS "
                 f"certificate with: dagmap keys renew {name}"
             )
+        unlisted = self._unlisted(name, out)
+        if unlisted is not None:
+            return self._list(name, unlisted)
         key = Ed25519PrivateKey.generate()
         public_key = key.public_key().public_bytes_raw()
         certificate = self.identity.certify(self.config.fleet_id, public_key, name)
-        entry = self.folder / "robots" / f"{name}.json"
         with _new_folder(out) as folder:
             _write_new(folder / "robot.key", _pem(key), 0o600)
             _write_new(folder / "certificate", certificate.hex().encode() + b"\n")
@@ -115,7 +122,23 @@ class Fleet:
             _write_new(folder / "tls.pem", self._leaf(public_key, name, addresses, days))
             _write_new(folder / "ca.pem", _read(self.folder / "ca.pem"))
             (folder / "revocations").mkdir()
-            _write_new(entry, json.dumps({"public_key": public_key.hex()}).encode() + b"\n")
+        return self._list(name, public_key)
+
+    def _unlisted(self, name: str, folder: Path) -> bytes | None:
+        """Public key of the robot in a folder, where it is this fleet's and called so."""
+        if not (folder / "robot.key").exists():
+            return None
+        try:
+            robot = open_robot(folder)
+        except KeysError:
+            return None
+        mine = (robot.name, robot.config.fleet_id) == (name, self.config.fleet_id)
+        return robot.identity.public_key if mine else None
+
+    def _list(self, name: str, public_key: bytes) -> Enrolled:
+        """Last of all: a name that is on the list has a folder, and cannot be had again."""
+        entry = json.dumps({"public_key": public_key.hex()}).encode() + b"\n"
+        _write_new(self.folder / "robots" / f"{name}.json", entry)
         return Enrolled(name, author_of(public_key), public_key)
 
     def renew(self, name: str, out: Path, days: int, addresses: Sequence[str] = ()) -> datetime:
@@ -187,7 +210,7 @@ class Fleet:
 
 def create_fleet(folder: Path, name: str) -> Fleet:
     """Make a fleet's key and folder. Raises KeysError where the folder holds something."""
-    if not 0 < len(name.encode()) <= MAX_NAME or not name.isprintable():
+    if not 0 < len(name.encode()) <= MAX_NAME or not printable(name):
         raise KeysError(f"--name {name!r}: 1 to {MAX_NAME} bytes of printable text are wanted")
     key = Ed25519PrivateKey.generate()
     public_key = key.public_key().public_bytes_raw().hex()
@@ -290,8 +313,9 @@ def _read(path: Path) -> bytes:
 
 def _write_new(path: Path, data: bytes, mode: int = 0o644) -> None:
     """A file that appears whole, with its mode from the start, where there was none."""
-    part = path.with_name(f".{path.name}.part")
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
+        part.unlink(missing_ok=True)  # of a process of this number that was killed
         descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
         try:
             with open(descriptor, "wb") as file:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
@@ -13,6 +15,7 @@ from .closing import Closing
 from .runtime import Runtime
 from .transport import Transport
 
+_PATIENCE = 10.0  # s for one asker, from the first byte to the last
 _TYPE = "text/plain; version=0.0.4; charset=utf-8"
 Sample = tuple[dict[str, str], float]
 
@@ -74,6 +77,7 @@ class _Server(ThreadingHTTPServer):
         self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler], most: int
     ) -> None:
         self._free = threading.Semaphore(most)
+        self._until: dict[Any, float] = {}  # when each asker has had its time
         self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
         super().__init__(address, handler)
 
@@ -81,10 +85,20 @@ class _Server(ThreadingHTTPServer):
         return self._free.acquire(blocking=False)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
+        self._until[request] = time.monotonic() + _PATIENCE
         try:
             super().process_request_thread(request, client_address)
         finally:
+            del self._until[request]
             self._free.release()
+
+    def service_actions(self) -> None:
+        """Several times a second: hang up on who would hold a place by a byte now and then."""
+        now = time.monotonic()
+        for request, until in self._until.copy().items():
+            if now >= until:
+                with suppress(OSError):  # it left by itself
+                    request.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: object, client_address: object) -> None:
         """The log is for the fleet: a line of many for everyone who hangs up would fill it."""
@@ -103,8 +117,6 @@ class MetricsServer(Closing):
         """askers: served at a time. Raises NetworkError where the address cannot be listened on."""
 
         class Handler(BaseHTTPRequestHandler):
-            timeout = 10
-
             def do_GET(self) -> None:
                 if self.path.split("?")[0] != "/metrics":
                     self.send_error(404, "only /metrics is here")

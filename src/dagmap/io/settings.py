@@ -126,7 +126,7 @@ class MetricsConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Numbers for Prometheus under http://LISTEN/metrics; off unless an address is given."""
 
     listen: str | None = None  # "127.0.0.1:9464"; anybody who reaches the address can read it
-    askers: int = 16  # at a time: each has a thread for as long as it may be silent, 10 s
+    askers: int = 16  # at a time: each has a thread for as long as it is there, 10 s
 
     def __post_init__(self) -> None:
         self._require_range("askers", 1, 1 << 10)

@@ -13,6 +13,7 @@ import threading
 from collections import Counter
 from collections.abc import Iterable
 from contextlib import suppress
+from datetime import datetime, timezone
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +22,8 @@ from ..messages import MAX_MESSAGE, kind_of, sender_of
 from ..model import AuthorId, NetworkError, Outgoing
 from .closing import Closing
 from .queues import Inbox, SendQueue
-from .settings import NetworkConfig, TlsConfig
+from .settings import NetworkConfig
+from .tls import tls_doubts
 
 if TYPE_CHECKING:
     import zenoh
@@ -238,9 +240,7 @@ def open_session(
     Raises NetworkError that names the endpoint or the file.
     """
     if network.tls is not None:
-        for name, path in _tls_files(network.tls, folder).items():
-            if not path.is_file():
-                raise NetworkError(f"network.tls.{name}: {path} is missing; correct the path")
+        tls_doubts(network.tls, folder, datetime.now(timezone.utc))
     config = module.Config()
     for key, value in session_config(network, folder, largest).items():
         try:
@@ -252,10 +252,6 @@ def open_session(
     except module.ZError as error:
         ends = ", ".join((*network.listen, *network.connect)) or "no endpoint"
         raise NetworkError(f"{table} ({ends}): {_brief(error)}; correct [{table}]") from None
-
-
-def _tls_files(tls: TlsConfig, folder: Path) -> dict[str, Path]:
-    return {name: folder / getattr(tls, name) for name in ("ca", "certificate", "key")}
 
 
 def _brief(error: Exception) -> str:
