@@ -42,6 +42,9 @@ retry_period = 0.5
 """
 
 
+_ports = iter(range(20_000 + os.getpid() % 60 * 200, 32_700))  # below those of connections
+
+
 def until(condition: Callable[[], Any], what: str = "") -> Any:
     """What the condition gives, once it is true. Fails after a minute."""
     deadline = time.monotonic() + PATIENCE
@@ -53,9 +56,12 @@ def until(condition: Callable[[], Any], what: str = "") -> Any:
 
 
 def free_port() -> int:
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        return int(sock.getsockname()[1])
+    """One that the system gives to nobody by itself, and this process to nobody else."""
+    for port in _ports:
+        with socket.socket() as sock, suppress(OSError):
+            sock.bind(("127.0.0.1", port))
+            return port
+    raise AssertionError("no free port")
 
 
 def plain(seed: int, **more: Any) -> Iterator[Cycle]:

@@ -183,7 +183,7 @@ class TestMistakes:
         a, b = (Robot(nursery, tmp_path, name) for name in "ab")
         with running(a):
             a.start("--until-agreed", 0.1)
-            assert a.wait() == 0
+            assert a.wait() == 0, a.log
         _made(b.ledger).write_bytes(a.ledger.read_bytes())
         assert self._refused(b, "ledger.db: the ledger of robot", "a file of its own")
 

@@ -64,7 +64,8 @@ def test_the_points_are_on_the_screen(run: Path) -> None:
         controls = window.controls
         wait_for(lambda: len(pixels(browser, amber)) > ENOUGH, "points in the state's colour")
         wait_for(lambda: "all 2 robots agree" in controls.standing.content, "the sign of agreement")
-        assert "all 2 robots agree" in browser.run("document.body.innerText")
+        says = "document.body.innerText"
+        wait_for(lambda: "all 2 robots agree" in browser.run(says), "the sign in the browser")
 
         # A point that is clicked tells its story.
         def told() -> bool:

@@ -39,7 +39,10 @@ WORDS += ("1 0 0 0 0 0 0 1", "a" * 300, "[", "]", ":", "[" * 3000, "\xff")
 
 
 def read(reader: Any, folder: Path, data: bytes, allowed: re.Pattern[str]) -> bool:
-    """Whether a reader (a module of `io.sources`) takes the folder that the input describes."""
+    """Whether a reader (a module of `io.sources`) takes the folder that the input describes.
+
+    A file `slam.txt` is given as poses; with a file `body`, poses are said to be the body's.
+    """
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     unpack(folder, data, allowed)
@@ -47,7 +50,12 @@ def read(reader: Any, folder: Path, data: bytes, allowed: re.Pattern[str]) -> bo
         if not reader.matches(folder):
             return False
         poses = folder / "slam.txt"
-        options = Options(max_features=50, max_depth=10.0, poses=poses if poses.is_file() else None)
+        options = Options(
+            max_features=50,
+            max_depth=10.0,
+            poses=poses if poses.is_file() else None,
+            body_poses=(folder / "body").is_file(),
+        )
         told = reader.describe(folder, options)
         for keep_going in (True, False):
             source = reader.open(folder, replace(options, keep_going=keep_going))

@@ -105,6 +105,7 @@ def seeds() -> Iterable[bytes]:
     yield pack([*rig, pictures[0], (pictures[1][0], pictures[1][1][:-9]), poses])
     slam = (b"slam.txt", b"1.0 0 0 0 0 0 0 1\n1100000000e9 0 0 0 0 0 0 1\n")
     yield pack([*rig, *pictures, slam])
+    yield pack([*rig, *pictures, slam, (b"body", b"")])
     yield pack([(b"other.txt", b"")])
     yield pack([(name.removeprefix(b"mav0/"), body) for name, body in [*rig, *pictures, poses]])
 

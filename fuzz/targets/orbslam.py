@@ -44,6 +44,12 @@ def seeds() -> Iterable[bytes]:
     rgb = b"".join(b"property uchar %s\n" % name for name in (b"red", b"green", b"blue"))
     yield pack([poses, (b"PointCloud.ply", ply + rgb + b"end_header\n0 0 2 4 5 6\n")])
     yield pack([poses])
+    body, seen = (b"body", b""), (b"MapPoints.txt", points)
+    mounted = b"T_BS:\n  data: [1, 0, 0, 0.1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n"
+    mounted += b"resolution: [48, 32]\nintrinsics: [60, 60, 24, 16]\n"
+    mounted += b"camera_model: pinhole\ndistortion_model: none\ndistortion_coefficients: []\n"
+    yield pack([poses, seen, body])
+    yield pack([poses, seen, body, (b"sensor.yaml", mounted)])
 
 
 PARSERS = {"dagmap.io.sources.orbslam": (), "dagmap.io.sources._trajectory": ()}
