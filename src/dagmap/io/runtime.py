@@ -35,7 +35,7 @@ from .queues import Inbox, Question
 
 TICK = 0.05  # s between the ticks of an agent, where nothing comes in
 _READING = 0.03  # s after which no further message is read in a step
-_SOON = 0.02  # s from what came in to the tick that folds it, together with what comes meanwhile
+_SOON = 0.05  # s from what came in to the tick that folds it, together with what comes meanwhile
 _STATE_PERIOD = 5.0  # s between two lines of the log that say how it stands
 _FETCH = 10  # retry periods that what others promise of the own chain gets to arrive
 _LOOK_PERIOD = 1.0  # s between two looks for transactions that a person brings
