@@ -227,9 +227,9 @@ class TestMetrics:
                 return True
             return _hung_up(slow)
 
-        until(hung_up)
+        assert until(hung_up, "the one place to be free again")
         address = f"http://127.0.0.1:{server.address[1]}/metrics"
-        until(lambda: "dagmap_cycles_total" in _try(address))
+        assert until(lambda: "dagmap_cycles_total" in _try(address))
 
     @pytest.mark.skipif(not socket.has_ipv6, reason="there is no IPv6 on this machine")
     def test_addresses_of_ipv6(self, opened: ExitStack) -> None:

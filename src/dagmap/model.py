@@ -27,7 +27,6 @@ MAX_DESCRIBED = 1024  # points of a keyframe: a record of them fits into a trans
 MAX_KEYFRAMES = 256  # of one author that a robot compares with its own
 DESCRIPTOR = 32  # bytes of a binary descriptor
 MAX_NAME = 64  # bytes of a robot's name
-FLEET_FRAME: FrameId  # defined below
 
 
 class DagmapError(Exception):
