@@ -315,10 +315,11 @@ class Agent:
 
     def _through_the_door(self, data: bytes, again: bool = False) -> list[Event]:
         """The one door: own and foreign transactions alike are judged, kept and folded."""
-        id_ = id_of(data)
-        if self.ledger.holds(id_):
-            return []
         try:
+            self._parsers.work(data, self.config)
+            id_ = id_of(data)
+            if self.ledger.holds(id_):
+                return []
             if self.config.closed and not again:
                 author, previous = glance(data)
                 if previous and not self.ledger.worth_judging(id_, author):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from functools import lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -247,7 +247,7 @@ class PlacingConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
         return round(self.tolerance * 1000)
 
 
-class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True, dict=True):
     """All parameters of one participant.
 
     fleet: name of the fleet. Its hash, with that of the fleet-wide parameters, heads every message.
@@ -299,10 +299,13 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
             except CycleError as error:
                 raise ConfigError(str(error)) from None
 
-    @property
+    @cached_property  # every message is asked for it
     def fleet_id(self) -> bytes:
         """8 bytes that name the fleet: a closed one by its key and its name."""
-        return _fleet_id(self.fleet, self.fleet_key)
+        named = b"dagmap fleet 1\0" + self.fleet.encode()
+        if self.closed:
+            named = b"dagmap closed fleet 1\0" + self.fleet_public_key + self.fleet.encode()
+        return hashlib.blake2b(named, digest_size=8).digest()
 
     @property
     def closed(self) -> bool:
@@ -314,20 +317,12 @@ class Config(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """The 32 bytes of the fleet key; none in an open fleet."""
         return bytes.fromhex(self.fleet_key)
 
-    @property
+    @cached_property
     def parameters_id(self) -> bytes:
         """8 bytes over all that every robot must hold alike, or it would compute another map."""
         graph = [self.graph.n_p, self.graph.n_c_max]
         shared = msgspec.json.encode([self.fold, self.transaction, graph])
         return hashlib.blake2b(b"dagmap parameters 1\0" + shared, digest_size=8).digest()
-
-
-@lru_cache  # every message is asked for it, several times
-def _fleet_id(fleet: str, key: str) -> bytes:
-    named = b"dagmap fleet 1\0" + fleet.encode()
-    if key:
-        named = b"dagmap closed fleet 1\0" + bytes.fromhex(key) + fleet.encode()
-    return hashlib.blake2b(named, digest_size=8).digest()
 
 
 C = TypeVar("C", bound=Config)

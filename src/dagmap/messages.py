@@ -19,8 +19,7 @@ from .config import Config
 from .model import AuthorId, Reason, TransactionId
 from .transaction import MAX_SIZE as MAX_TRANSACTION
 from .transaction import MIN_SIZE as MIN_TRANSACTION
-from .transaction import Transaction
-from .transaction import parse as parse_transaction
+from .transaction import Transaction, check_work, parse_worked
 from .wire import Reader, Refusal
 
 VERSION = 1
@@ -196,7 +195,11 @@ def _decode_want(body: Reader) -> Want:
 
 @dataclass(frozen=True, slots=True)
 class Parsers:
-    """How foreign bytes are judged: pure functions, so agents of one process may share results."""
+    """How foreign bytes are judged: pure functions, so agents of one process may share results.
+
+    transaction: the judge of those whose proof of work holds.
+    """
 
     message: Callable[[bytes, Config], tuple[AuthorId, Message]] = parse
-    transaction: Callable[[bytes, Config], Transaction] = parse_transaction
+    work: Callable[[bytes, Config], None] = check_work
+    transaction: Callable[[bytes, Config], Transaction] = parse_worked

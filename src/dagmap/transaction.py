@@ -30,6 +30,7 @@ VERSION = 1
 MAX_SIZE = 56_000  # bytes, so that a message that carries one stays under 60 KB
 MIN_SIZE = 105  # one that says nothing
 MAX_LAMPORT = (1 << 48) - 1
+_START = 1 + 32  # bytes: version and public key
 _END = 4 + 64  # bytes: nonce and signature
 _SIGNED = b"dagmap transaction 1\0"
 _WORKED = b"dagmap work 1\0"
@@ -109,31 +110,37 @@ def glance(data: bytes) -> tuple[AuthorId, TransactionId | None]:
     Raises Refusal where they cannot be read.
     """
     reader = Reader(data)
-    author = author_of(_public_key(reader))
+    author = author_of(reader.take(_START)[1:])
     return author, reader.take(32) if reader.number(MAX_SEQUENCE) else None
 
 
 def parse(data: bytes, config: Config) -> Transaction:
     """Judge foreign bytes. Raises Refusal; the cheap checks come first, the payload last."""
-    if len(data) > MAX_SIZE:
-        raise Refusal(Reason.MALFORMED, f"transaction of {len(data)} bytes")
-    reader = Reader(data)
-    public_key = _public_key(reader)
-    author = author_of(public_key)
-    # First of all, and without reading on: a flood that has not worked costs two hashes.
+    check_work(data, config)
+    return parse_worked(data, config)
+
+
+def check_work(data: bytes, config: Config) -> None:
+    """What is judged first of all, without reading on: a flood that has not worked costs one
+    hash of its bytes. Raises Refusal."""
+    if not MIN_SIZE <= len(data) <= MAX_SIZE:
+        reason = Reason.MALFORMED if len(data) > MAX_SIZE else Reason.TRUNCATED
+        raise Refusal(reason, f"transaction of {len(data)} bytes")
+    if data[0] != VERSION:
+        raise Refusal(Reason.VERSION, f"transaction version {data[0]}")
     if not _work_holds(_work_seed(config, data[:-_END]), data[-_END:-64], config):
-        raise Refusal(Reason.PROOF_OF_WORK, fault=author)
+        raise Refusal(Reason.PROOF_OF_WORK, fault=author_of(data[1:_START]))
+
+
+def parse_worked(data: bytes, config: Config) -> Transaction:
+    """Judge foreign bytes whose work holds. Raises Refusal."""
+    reader = Reader(data)
+    public_key = reader.take(_START)[1:]
+    author = author_of(public_key)
     try:
         return _parse(reader, data, public_key, author, config)
     except Refusal as refusal:
         raise Refusal(refusal.reason, refusal.detail, author) from None
-
-
-def _public_key(reader: Reader) -> bytes:
-    version = reader.take(1)[0]
-    if version != VERSION:
-        raise Refusal(Reason.VERSION, f"transaction version {version}")
-    return reader.take(32)
 
 
 def _parse(

@@ -45,10 +45,10 @@ class SharedParsers:
     """Parsers for the agents of one fleet: each message and transaction is parsed once."""
 
     def __init__(self) -> None:
-        judged = _Memo(transaction.parse)
+        judged = _Memo(transaction.parse_worked)
 
         def parse(data: bytes, config: Config) -> Transaction:
             # agents forget columns on their own copy; copy.copy takes five times as long
             return Transaction(*_fields(judged(data, config)))
 
-        self.parsers = Parsers(_Memo(messages.parse), parse)
+        self.parsers = Parsers(_Memo(messages.parse), transaction=parse)
