@@ -50,6 +50,7 @@ class Robot:
     name: str
     connect: tuple[int, ...] = ()  # ports on this machine
     recording: Path | None = None
+    program: str = "from dagmap.cli import main; main()"
     port: int = field(default_factory=_free_port)
     process: subprocess.Popen[bytes] | None = None
     began: int = 0  # ns, when the process was started
@@ -71,7 +72,7 @@ class Robot:
             f'listen = ["tcp/127.0.0.1:{self.port}"]\nconnect = {json.dumps(ends)}\n'
             "scouting = false\ngossip = false\n"
         )
-        command = [sys.executable, "-c", "from dagmap.cli import main; main()", "agent", str(file)]
+        command = [sys.executable, "-c", self.program, "agent", str(file)]
         self.began = time.monotonic_ns()
         with self.log.open("wb") as log:
             self.process = subprocess.Popen(
@@ -120,6 +121,12 @@ class Robot:
         assert self.process is not None
         status = Path(f"/proc/{self.process.pid}/status").read_text()
         return 1024 * int(status.partition("VmHWM:")[2].split()[0])
+
+    def memory(self) -> int:
+        """Memory now, bytes."""
+        assert self.process is not None
+        pages = Path(f"/proc/{self.process.pid}/statm").read_text().split()[1]
+        return int(pages) * os.sysconf("SC_PAGE_SIZE")
 
     def stop(self) -> None:
         if self.process is not None:

@@ -1,154 +1,175 @@
-"""One long mission: three robots walk the office over and over, faster than real time.
+"""One long mission: three robots, each a process, walk the office over and over.
 
-`python bench/mission.py [--minutes 60] [--out DIR]` writes mission.json and mission.png: memory,
-ledger, traffic and the time of a cycle against the time of the mission. Every round sees the same
-places with other noise, as a SLAM that never stops would.
+`python bench/mission.py [--minutes 60] [--speed 1] [--out DIR]` writes mission.json and
+mission.png: memory, ledger, traffic, processor time and the time of a cycle against the time of the
+mission. Every round sees the same places with other noise, as a SLAM that never stops would.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import resource
 import sys
+import tempfile
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from dagmap import Agent, Config, Cycle, Identity
-from dagmap.io.sources import open_source
+from dagmap import Cycle
+from dagmap.cli.agent import AgentCommand
+from dagmap.io.settings import Settings
+from dagmap.io.sources import Source, open_source
+from fleet_robots import Robot, running, until
 
 OFFICE = Path(__file__).parents[1] / "examples" / "office"
+ROBOTS = 3
 RATE = 10  # cycles a second
 POINTS = 1000  # in a cycle
 NOISE = 0.005  # m, of every point anew
+PROGRAM = "import sys; sys.path.insert(0, {here!r}); import mission; mission.walk({rest})"
+Samples = dict[str, list[list[float]]]  # what, then robot, then minute
 
 
-@dataclass
-class Track:
-    """One robot and what it costs, a value a minute."""
+class Rounds:
+    """A robot's round through its part of the office, there and back so that nothing jumps."""
 
-    agent: Agent
-    seen: list[Cycle]
-    sent: int = 0
-    cycle_ms: list[float] = field(default_factory=list)  # p95 of the cycles of the minute
-    worst_ms: list[float] = field(default_factory=list)
-    traffic: list[int] = field(default_factory=list)  # bytes sent
-    ledger: list[int] = field(default_factory=list)  # bytes
-    held: list[int] = field(default_factory=list)  # bytes that fold, evidence and DAG hold
-    spent: list[float] = field(default_factory=list)
+    def __init__(self, number: int, count: int) -> None:
+        self.name = f"robot{number}"
+        self._seen = list(open_source(OFFICE / self.name))
+        self._seed, self._count = number, count
 
-    def cycle(self, number: int, rng: np.random.Generator) -> Cycle:
-        """The next cycle of its endless round, there and back so that nothing jumps."""
-        lap = number % (2 * len(self.seen))
-        base = self.seen[min(lap, 2 * len(self.seen) - 1 - lap)]
-        points = np.asarray(base.points, np.float64)
-        points = points[rng.integers(0, len(points), POINTS)]
-        points = points + rng.normal(0.0, NOISE, points.shape)
-        return Cycle(stamp=1.0 + number / RATE, pose=base.pose, points=points)
+    def __len__(self) -> int:
+        return self._count
+
+    def __iter__(self) -> Iterator[Cycle]:
+        rng = np.random.default_rng(self._seed)
+        for number in range(self._count):
+            lap = number % (2 * len(self._seen))
+            base = self._seen[min(lap, 2 * len(self._seen) - 1 - lap)]
+            points = np.asarray(base.points, np.float64)
+            points = points[rng.integers(0, len(points), POINTS)]
+            points = points + rng.normal(0.0, NOISE, points.shape)
+            yield Cycle(stamp=1.0 + number / RATE, pose=base.pose, points=points)
 
 
-def fly(minutes: int, tracks: list[Track]) -> Iterator[int]:
-    """Let the robots work; a number a minute of the mission."""
-    rng = np.random.default_rng(1)
-    for number in range(minutes * 60 * RATE):
-        now = number / RATE
-        for track in tracks:
-            cycle = track.cycle(number, rng)
-            started = time.thread_time()  # what else the machine does is no matter
-            track.agent.observe(cycle, now)
-            track.agent.tick(now)
-            track.spent.append((time.thread_time() - started) * 1e3)
-            for out in track.agent.outbox():
-                track.sent += len(out.data)
-                for other in tracks:
-                    if other is not track:
-                        other.agent.receive(out.data, now)
-        if (number + 1) % (60 * RATE) == 0:
-            for track in tracks:
-                sample(track)
-            yield (number + 1) // (60 * RATE)
+def walk(number: int, count: int, speed: float) -> None:
+    """`dagmap agent FILE --speed N` of one robot, with a walk that no recording could hold."""
+
+    class Walker(AgentCommand):
+        def _open_source(self, settings: Settings) -> Source:
+            return Rounds(number, count)
+
+    Walker(Path(sys.argv[2]), speed, ROBOTS - 1, None, False, "debug", False).run()
 
 
-def sample(track: Track) -> None:
-    agent = track.agent
-    track.cycle_ms.append(float(np.percentile(track.spent, 95)))
-    track.worst_ms.append(max(track.spent))
-    track.traffic.append(track.sent)
-    track.ledger.append(sum(len(tx.data) for tx in agent.ledger))
-    track.held.append(agent.consensus.nbytes + agent.observing.graph.nbytes)
-    track.sent = 0
-    track.spent.clear()
+def fly(minutes: int, speed: float, folder: Path) -> dict[str, Any]:
+    """Let the robots work; what was measured, a value a minute of the mission."""
+    count = minutes * 60 * RATE
+    robots: list[Robot] = []
+    for i in range(ROBOTS):
+        rest = f"{i + 1}, {count}, {speed}"
+        program = PROGRAM.format(here=str(Path(__file__).parent), rest=rest)
+        others = tuple(robot.port for robot in robots)
+        robots.append(Robot(folder, f"robot{i + 1}", others, program=program))
+    began = time.monotonic()
+    with running(*robots):
+        for robot in robots:
+            robot.start()
+        for robot in robots:
+            robot.wait_for("observed")
+        sampled = sample(robots, minutes, 60.0 / speed)
+        until(lambda: all(r.status().get("cycles") == count for r in robots), "all cycles", 1.0)
+        until(lambda: len({r.status().get("digest") for r in robots}) == 1, "one map", 1.0)
+        answers = [robot.status() for robot in robots]
+        peak = max(robot.peak() for robot in robots)
+        for robot in robots:
+            robot.stop()
+        sampled["cycle_ms"] = [cycle_ms(robot) for robot in robots]
+        ledger = max(robot.ledger.stat().st_size for robot in robots)
+    times = np.array(sampled["cycle_ms"])
+    return {
+        "minutes": minutes,
+        "speed": speed,
+        "wall_s": time.monotonic() - began,
+        "digests": sorted({answer["digest"] for answer in answers}),
+        "transactions": answers[0]["transactions"],
+        "nodes": answers[0]["map"]["nodes"],
+        "peak_mb": peak / 1e6,
+        "ledger_mb": ledger / 1e6,
+        "last_to_fifth": [float(row[-1] / row[min(4, minutes - 1)]) for row in times],
+        "robots": sampled,
+    }
 
 
-def draw(tracks: list[Track], rss: list[float], path: Path) -> None:
+def sample(robots: list[Robot], minutes: int, period: float) -> Samples:
+    """What each robot costs, at the end of every minute of the mission."""
+    values: dict[str, Callable[[Robot], float]] = {
+        "memory_mb": lambda robot: robot.memory() / 1e6,
+        "ledger_mb": lambda robot: robot.ledger.stat().st_size / 1e6,
+        "sent_kb": sent_kb,
+        "processor_s": lambda robot: robot.cpu(),
+    }
+    found: Samples = {what: [[] for _ in robots] for what in values}
+    began = time.monotonic()
+    for minute in range(1, minutes + 1):
+        time.sleep(max(0.0, began + minute * period - time.monotonic()))
+        for what, of in values.items():
+            for i, robot in enumerate(robots):
+                found[what][i].append(of(robot))
+        told = ", ".join(f"{what} {rows[0][-1]:,.1f}" for what, rows in found.items())
+        sys.stderr.write(f"minute {minute}: {told}\n")
+    for what in ("sent_kb", "processor_s"):  # what counts is that of the minute
+        found[what] = [list(np.diff(row, prepend=0.0)) for row in found[what]]
+    return found
+
+
+def sent_kb(robot: Robot) -> float:
+    """Transactions, announcements and questions so far, kB."""
+    table = until(robot.status, "status")["traffic"]["sent"]
+    return float(sum(row["bytes"] for row in table.values())) / 1e3
+
+
+def cycle_ms(robot: Robot) -> list[float]:
+    """What 95 % of the calls of `observe` in each minute of the mission took at most, ms."""
+    each = [float(line["ms"]) for line in robot.lines("observed")]
+    length = 60 * RATE
+    starts = range(0, len(each) - length + 1, length)
+    return [float(np.percentile(each[i : i + length], 95)) for i in starts]
+
+
+def draw(result: dict[str, Any], path: Path) -> None:
     figure = Figure(figsize=(9, 6), layout="constrained")
-    axes = figure.subplots(2, 2)
-    minutes = np.arange(1, len(rss) + 1)
-    for (row, column), name, values in (
-        ((0, 1), "ledger of a robot, MB", [np.array(t.ledger) / 1e6 for t in tracks]),
-        ((1, 0), "sent by a robot, kB a minute", [np.array(t.traffic) / 1e3 for t in tracks]),
-        (
-            (1, 1),
-            "p95 of a cycle, ms of processor",
-            [np.array(t.cycle_ms) for t in tracks],
-        ),
-    ):
-        for i, line in enumerate(values):
-            axes[row, column].plot(minutes, line, label=f"robot {i + 1}")
-        axes[row, column].set_title(name)
-    axes[0, 0].plot(minutes, np.array(rss) / 3)
-    axes[0, 0].set_title("memory of the process, MB a robot")
-    axes[1, 1].legend()
-    for axis in axes.flat:
+    panels = (
+        ("memory_mb", "memory of a robot, MB"),
+        ("ledger_mb", "ledger of a robot on disk, MB"),
+        ("sent_kb", "sent by a robot, kB a minute"),
+        ("cycle_ms", "observe, 95 % within, ms"),
+    )
+    for axis, (what, title) in zip(figure.subplots(2, 2).flat, panels, strict=True):
+        for i, row in enumerate(result["robots"][what]):
+            axis.plot(np.arange(1, len(row) + 1), row, label=f"robot {i + 1}")
+        axis.set_title(title)
         axis.set_xlabel("minute of the mission")
         axis.set_ylim(bottom=0)
+    figure.axes[0].legend()
     figure.savefig(path, dpi=120)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--minutes", type=int, default=60)
+    parser.add_argument("--speed", type=float, default=1.0, help="times the pace of the robots")
     parser.add_argument("--out", type=Path, default=Path("out/mission"))
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    config = Config()
-    tracks = [
-        Track(
-            Agent(Identity.from_seed(bytes([1 + i]) * 32), config),
-            list(open_source(OFFICE / f"robot{1 + i}")),
-        )
-        for i in range(3)
-    ]
-    rss, started = [], time.perf_counter()
-    for minute in fly(options.minutes, tracks):
-        rss.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3)
-        first = tracks[0]
-        sys.stderr.write(
-            f"minute {minute}: {rss[-1]:,.0f} MB, ledger {first.ledger[-1] / 1e6:.1f} MB, "
-            f"{first.traffic[-1] / 1e3:,.0f} kB sent, cycle {first.cycle_ms[-1]:.1f} ms\n"
-        )
-    digests = {track.agent.digest().hex() for track in tracks}
-    result = {
-        "minutes": options.minutes,
-        "wall_s": time.perf_counter() - started,
-        "digests": sorted(digests),
-        "peak_mb_a_robot": rss[-1] / 3,
-        "ledger_mb": tracks[0].ledger[-1] / 1e6,
-        "robots": [
-            {
-                name: getattr(track, name)
-                for name in ("cycle_ms", "worst_ms", "traffic", "ledger", "held")
-            }
-            for track in tracks
-        ],
-    }
+    with tempfile.TemporaryDirectory() as folder:
+        result = fly(options.minutes, options.speed, Path(folder))
     (options.out / "mission.json").write_text(json.dumps(result, indent=1) + "\n")
-    draw(tracks, rss, options.out / "mission.png")
+    draw(result, options.out / "mission.png")
     sys.stdout.write(json.dumps({k: v for k, v in result.items() if k != "robots"}) + "\n")
 
 
