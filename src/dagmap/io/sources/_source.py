@@ -74,17 +74,22 @@ class Description:
 
 @dataclass(slots=True)
 class Skips:
-    """What was left out of a recording, because `keep_going` says so."""
+    """What was left out of a recording, because `keep_going` says so; once, however often it is
+    read."""
 
     keep_going: bool
     told: list[str] = field(default_factory=list)
     count: int = 0
+    _known: set[int] = field(default_factory=set)
 
     def note(self, error: RecordingError) -> None:
         """Leave one thing out. Raises the error where that is not wanted."""
         if not self.keep_going:
             hint = "" if "--keep-going" in str(error) else "; --keep-going leaves it out"
             raise RecordingError(f"{error}{hint}") from None
+        if hash(str(error)) in self._known:
+            return
+        self._known.add(hash(str(error)))
         self.count += 1
         if len(self.told) < _TOLD:
             self.told.append(str(error))
