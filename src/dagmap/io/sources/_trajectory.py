@@ -30,8 +30,7 @@ def doubts(file: Path, same: bool) -> tuple[str, ...]:
     ORB-SLAM3 saves the poses of the body in its EuRoC format (ns) if it is inertial, else those of
     the left camera, as always in TUM's (s).
     """
-    first = (words[0] for _, words in read_rows(file) if words[0].replace(".", "").isdecimal())
-    if same or float(next(first, "0")) <= _NANOSECONDS:
+    if same or _first_stamp(file) <= _NANOSECONDS:
         return ()
     said = (
         f"the stamps of {file.name} are in ns, as ORB-SLAM3 saves them for EuRoC: its poses are "
@@ -40,6 +39,16 @@ def doubts(file: Path, same: bool) -> tuple[str, ...]:
         "if not"
     )
     return (said,)
+
+
+def _first_stamp(file: Path) -> float:
+    """Of the first line that begins with a number."""
+    for _, words in read_rows(file):
+        try:
+            return float(words[0])
+        except ValueError:
+            continue
+    return 0.0
 
 
 def read_tum(file: Path, skips: Skips) -> Trajectory:
