@@ -280,3 +280,16 @@ def test_a_drive_becomes_a_map(drive: Path, tmp_path: Path) -> None:
     assert "5 cycles" in run.stdout
     run = dagmap("replay", drive, "--out", tmp_path / "out", "--max-features", 200)
     assert run.returncode == 0, run.stderr
+
+
+def test_no_error_goes_on_for_pages(sequence: Path) -> None:
+    cloud = sorted(sequence.glob("1.*"))[0]
+    text = b"# .PCD v0.7\nFIELDS " + b"9" * 100_000 + b" y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+    cloud.with_suffix(".pcd").write_bytes(
+        text + b"WIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA ascii\n1 2 3\n"
+    )
+    for other in sequence.glob("*.ply"):
+        other.unlink()
+    with pytest.raises(RecordingError, match="pcd: .*; copy or write it anew") as caught:
+        list(open_source(sequence))
+    assert len(str(caught.value)) < 2000

@@ -96,6 +96,11 @@ _DEFINITIONS = """SELECT topic_type, encoded_message_definition FROM message_def
 _MESSAGES = "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
 
 
+def one_line(error: Exception) -> str:
+    """What SQLite says, which may quote what it has read."""
+    return "".join(c if c.isprintable() else "?" for c in str(error))[:200]
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[sqlite3.Connection]:
     uri = f"{path.resolve().as_uri()}?mode=ro&immutable=1"

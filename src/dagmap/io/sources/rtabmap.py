@@ -19,7 +19,7 @@ import numpy as np
 
 from ...model import Cycle, Floats, RecordingError
 from ._source import Description, Item, Options, Skips, checked
-from ._storage import DAMAGED, SQLITE, cut_short, require_plain
+from ._storage import DAMAGED, SQLITE, cut_short, one_line, require_plain
 
 UNDERSTANDS = "an RTAB-Map database (.db)"
 _NODES = "SELECT id, map_id, stamp, pose FROM Node WHERE id > 0 ORDER BY id"
@@ -130,7 +130,8 @@ class RtabmapDatabase:
             return np.array(rows, np.float64).reshape(-1, 3)
         except (TypeError, ValueError) as error:
             raise RecordingError(
-                f"{self._path}: node {node.id}: a position is no number ({error}); copy it anew"
+                f"{self._path}: node {node.id}: a position is no number ({one_line(error)}); copy "
+                "it anew"
             ) from None
 
     def _chosen(self, points: Floats) -> Floats:
@@ -161,8 +162,8 @@ class RtabmapDatabase:
             if not rising:
                 self.skips.note(
                     RecordingError(
-                        f"{self._path}: node {id_}: its stamp {stamp!r} does not come after "
-                        f"{last.get(session)}, that of the node before"
+                        f"{self._path}: node {id_}: its stamp {repr(stamp)[:40]} does not come "
+                        f"after {last.get(session)}, that of the node before"
                     )
                 )
                 continue
@@ -180,7 +181,9 @@ class RtabmapDatabase:
             if not rows:
                 raise
             self.skips.note(
-                RecordingError(f"{self._path}: Node: damaged after {len(rows)} nodes ({error})")
+                RecordingError(
+                    f"{self._path}: Node: damaged after {len(rows)} nodes ({one_line(error)})"
+                )
             )
         return rows
 
@@ -267,8 +270,8 @@ def _database(path: Path) -> Iterator[sqlite3.Connection]:
             yield database
     except (sqlite3.Error, OSError, OverflowError, UnicodeDecodeError) as error:
         raise RecordingError(
-            f"{path}: damaged, cut short, or not of RTAB-Map ({error}); copy it anew, or run "
-            "rtabmap-recovery on it"
+            f"{path}: damaged, cut short, or not of RTAB-Map ({one_line(error)}); copy it anew, or "
+            "run rtabmap-recovery on it"
         ) from None
 
 
@@ -302,6 +305,8 @@ def _version(path: Path, database: sqlite3.Connection) -> str:
     try:
         require_plain(database, _TABLES)
     except ValueError as error:
-        raise RecordingError(f"{path}: {error}; copy it anew, or have RTAB-Map save it") from None
+        raise RecordingError(
+            f"{path}: {one_line(error)}; copy it anew, or have RTAB-Map save it"
+        ) from None
     row = database.execute("SELECT version FROM Admin").fetchone()
     return "of unknown version" if row is None else str(row[0])[:20]
