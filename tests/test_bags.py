@@ -15,7 +15,7 @@ import pytest
 from rosbags.rosbag1 import Writer
 
 from bags import Make, Message, pictures, pose_at, write_bag
-from dagmap.io.sources import Options, describe_source, open_source
+from dagmap.io.sources import Options, _bagged, describe_source, open_source
 from dagmap.io.sources._poses import FrameTree, between, inverse
 from dagmap.model import RecordingError
 from test_replay import dagmap
@@ -400,6 +400,22 @@ def test_a_bag_of_several_files(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="walk: .*--keep-going"):
         open_source(folder)
     assert len(list(open_source(folder, Options(keep_going=True)))) == 4
+
+
+def test_pictures_far_from_their_partners_fill_no_memory(tmp_path: Path) -> None:
+    make = Make()
+    messages = rgbd(make)
+    depths = [m for m in messages if m[0] == "/camera/depth/image_raw"]
+    late = [(*m[:2], m[2] + 100, m[3]) for m in depths]
+    others = [m for m in messages if m not in depths]
+    path = write_bag(tmp_path / "walk.mcap", make, in_order([*others, *late]))
+    assert len(list(open_source(path))) == 3
+    for name, most in (("_STORED", 2), ("_STORED_BYTES", 150_000)):
+        with (
+            patch.object(_bagged, name, most),
+            pytest.raises(RecordingError, match="3 pictures of .* bytes wait .*ros2 bag convert"),
+        ):
+            list(open_source(path))
 
 
 def test_without_rosbags_the_extra_is_named(tmp_path: Path) -> None:
