@@ -93,10 +93,9 @@ def crossed(found: Evidence, place: Int64s) -> Bools:
     """
     cubes, at = np.unique(place, return_inverse=True)
     brief = found.moments < _BRIEF
-    passed, share, ended = (
-        log2_16(np.maximum(_about(cubes, np.bincount(at, column, len(cubes)))[at], 1))
-        for column in (brief * found.passed, brief * found.ended, found.ended)
-    )
+    columns = (brief * found.passed, brief * found.ended, found.ended)
+    sums = _about(cubes, np.stack([np.bincount(at, column, len(cubes)) for column in columns]))
+    passed, share, ended = log2_16(np.maximum(sums, 1))[:, at]
     balance = passed + 2 * (share - ended) - 2 * log2_16(np.maximum(found.moments, 1))
     return np.asarray(brief & (balance >= _CROSSED))
 
@@ -118,25 +117,30 @@ def gone(found: Evidence, place: Int64s, moment: Int64s) -> Bools:
     when = np.searchsorted(moments, moment[asked])
     cubes, at = np.unique(place[asked], return_inverse=True)
     groups, group = np.unique(when * len(cubes) + at, return_inverse=True)
-    with_them = _about(cubes, np.bincount(group, marked[asked]), groups)[group]
-    of_all = _about(cubes, np.bincount(group), groups)[group]
+    counts = np.stack([np.bincount(group, marked[asked]), np.bincount(group)])
+    with_them, of_all = _about(cubes, counts, groups)[:, group]
     left = (with_them >= _TOGETHER) & (2 * with_them >= of_all)
     out[asked] = left & (found.moments[asked] < _LASTING)
     return out
 
 
 def _about(cubes: Int64s, values: npt.NDArray[np.generic], groups: Int64s | None = None) -> Int64s:
-    """Sums of whole values over the 27 cubes about each cube; or about each group, where a group
-    is a part of a cube: cubes times its kind, plus the place of its cube in `cubes` (ascending)."""
-    groups = np.arange(len(cubes)) if groups is None else groups
-    kind, at = np.divmod(groups, len(cubes))
-    whole, out = values.astype(np.int64), np.zeros(len(groups), np.int64)
+    """Sums of whole values (k, N) over the 27 cubes about each cube; or about each group, where a
+    group is a part of a cube: cubes times its kind, plus the place of its cube in `cubes`
+    (ascending)."""
+    whole = values.astype(np.int64)
+    out = np.zeros_like(whole)
+    kind, at = np.divmod(np.arange(len(cubes)) if groups is None else groups, len(cubes))
     for shift in (_CUBE @ _STRIDES).tolist():
         beside = np.searchsorted(cubes, cubes + shift).clip(max=len(cubes) - 1)
-        there = cubes[beside] == cubes + shift
-        wanted = kind * len(cubes) + beside[at]
-        other = np.searchsorted(groups, wanted).clip(max=len(groups) - 1)
-        out += np.where(there[at] & (groups[other] == wanted), whole[other], 0)
+        there = np.flatnonzero((cubes[beside] == cubes + shift)[at])
+        other = beside[at[there]]
+        if groups is not None:
+            wanted = kind[there] * len(cubes) + other
+            other = np.searchsorted(groups, wanted).clip(max=len(groups) - 1)
+            same = groups[other] == wanted
+            there, other = there[same], other[same]
+        out[:, there] += whole[:, other]
     return out
 
 
