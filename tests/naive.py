@@ -452,7 +452,7 @@ def naive_misses(config: FoldConfig, fold: NaiveMap, rays: NaiveRays) -> list[in
         gains = []
         for bits in range(37):
             below = [suspect[k] for k in mine if balances[k] <= 16 * bits and bits > 0]
-            gains.append(4 * sum(below) - len(below) + 64 * (bits == 36))
+            gains.append(4 * sum(below) - len(below) + 16 * (bits == 36))
         return gains.index(max(gains))
 
     learned = {

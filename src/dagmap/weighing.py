@@ -17,7 +17,7 @@ from .model import Bools, Int32s, Int64s
 
 SIXTEENTHS = 16
 MOST_DOUBT = 36  # bits; what was found with the truth at hand, for a sensor that sees densely
-_PRIOR = 64  # nodes that must speak against that
+_PRIOR = 16  # nodes that must speak against that
 # 256 * 2^(k / 16), rounded up, k from 1 to 15: where the fraction of a logarithm steps.
 _STEPS = np.array(
     [268, 280, 292, 305, 318, 332, 347, 363, 379, 395, 413, 431, 450, 470, 491], np.int64
