@@ -194,8 +194,9 @@ class RgbdBag:
             size = sum(len(each.raw) for each in waiting)
             if len(waiting) > _STORED or size > _STORED_BYTES:
                 raise RecordingError(
-                    f"{self._bag.path}: {self._depth} and {self._color} lie too far apart in the "
-                    f"file: {len(waiting)} pictures of {size} bytes wait for their partners at "
+                    f"{self._bag.path}: {self._depth} and {self._color}"
+                    " lie too far apart in the file: "
+                    f"{len(waiting)} pictures of {size} bytes wait for their partners at "
                     f"{message.stamp:.6f} s; sort it with `ros2 bag convert`"
                 )
 
