@@ -445,20 +445,22 @@ def naive_misses(config: FoldConfig, fold: NaiveMap, rays: NaiveRays) -> list[in
         balance -= naive_log2(1 + passed[k]) + 2 * naive_log2(1 + hidden[k])
         balances.append(balance - 2 * record)
         records.append(record)
-    suspect = [a > b for a, b in zip(passed, ended, strict=True)]
 
-    def naive_doubt(mine: list[int]) -> int:
-        """Of 0 to 36 bits those below which suspects exceed a quarter by the most, or 36."""
+    def naive_doubt(author: int) -> int:
+        """Of 0 to 36 bits those below which denials exceed a sixth by the most, or 36."""
+        mine = [k for k, node in enumerate(fold.nodes) if author in node.seen]
+        cells = {k: rays.cell_of(fold.nodes[k].seed) for k in mine}
+        denied = {
+            k: min(32, rays.passes[author, cells[k]]) > min(32, rays.ends[author, cells[k]])
+            for k in mine
+        }
         gains = []
         for bits in range(37):
-            below = [suspect[k] for k in mine if balances[k] <= 16 * bits and bits > 0]
-            gains.append(4 * sum(below) - len(below) + 16 * (bits == 36))
+            below = [denied[k] for k in mine if balances[k] <= 16 * bits and bits > 0]
+            gains.append(6 * sum(below) - len(below) + 16 * (bits == 36))
         return gains.index(max(gains))
 
-    learned = {
-        author: naive_doubt([k for k in range(len(balances)) if author in fold.nodes[k].seen])
-        for author in observed
-    }
+    learned = {author: naive_doubt(author) for author in observed}
     out = []
     for k, node in enumerate(fold.nodes):
         doubt = min(learned[a] for a in node.seen) if config.doubt is None else config.doubt

@@ -137,14 +137,16 @@ class RayEvidence:
 
     def judge(
         self, say: Int64s, seed: Int32s, origin: Int32s, first: Int32s, entries: Int32s
-    ) -> Int32s:
+    ) -> tuple[Int32s, Bools]:
         """(N, 7) hits, witnesses, against, distance, passed, ended and hidden of nodes, without
-        arrays of (N, A); see `kernels.judging.judge`."""
-        out = np.zeros((len(seed), 7), np.int32)
+        arrays of (N, A), and (E,) which entries are denied; see `kernels.judging.judge`."""
+        out, denied = np.zeros((len(seed), 7), np.int32), np.zeros(len(entries), np.bool_)
         part, touched = np.zeros((self._authors, 4), np.int32), np.zeros(self._authors, np.int32)
         held, cell, limit = self._bricks, self._cell, self._limit
-        judging.judge(held, cell, limit, say, seed, origin, first, entries, part, touched, out)
-        return out
+        judging.judge(
+            held, cell, limit, say, seed, origin, first, entries, part, touched, out, denied
+        )
+        return out, denied
 
     def _add(self, author: int, sign: int) -> None:
         """Add what is marked to the counters of an author."""

@@ -123,8 +123,9 @@ class DefaultFold:
         room = np.zeros((matching.MOMENTS + 1, 2), np.int32)
         matching.support(nodes, self._shift, reach, _SAY[0], part, touched, room, around)
         say = np.array([self._config.hit_say, self._config.miss_say, *_SAY[1:]], np.int64)
-        said = rays.judge(say, nodes.seed[:n], nodes.origin, nodes.first, nodes.entries)
-        return weighing.Evidence(*(plain(c) for c in said.T), *(plain(c) for c in around.T))
+        said, denied = rays.judge(say, nodes.seed[:n], nodes.origin, nodes.first, nodes.entries)
+        columns = (plain(column) for column in (*said.T, *around.T))
+        return weighing.Evidence._make((*columns, denied))
 
     def first_authors(self) -> Int32s:
         """(N,) index of the author whose observation each node began with."""

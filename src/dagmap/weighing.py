@@ -17,7 +17,8 @@ from .model import Bools, Int32s, Int64s
 
 SIXTEENTHS = 16
 MOST_DOUBT = 36  # bits; what was found with the truth at hand, for a sensor that sees densely
-_PRIOR = 16  # nodes that must speak against that
+_PRIOR = 16  # votes that must speak against that
+_DENIED = 5  # votes of a node that its author's rays deny; one that they do not has one, against
 # 256 * 2^(k / 16), rounded up, k from 1 to 15: where the fraction of a logarithm steps.
 _STEPS = np.array(
     [268, 280, 292, 305, 318, 332, 347, 363, 379, 395, 413, 431, 450, 470, 491], np.int64
@@ -45,6 +46,7 @@ class Evidence(NamedTuple):
     hidden: Int32s  # (N,) ends that lie between that sensor and the node
     support: Int32s  # (N,) observations around the node, its own among them
     moments: Int32s  # (N,) in how many cycles those were made at least
+    denied: Bools  # (E,) of an author in a node: more of its own rays pass there than end
 
 
 def log2_16(values: npt.NDArray[np.integer]) -> Int64s:
@@ -79,35 +81,35 @@ def doubts(
     """(N,) what the balance of each node must exceed, sixteenths of bits: it is learned.
 
     How much lies around a real node depends on how densely its sensor sees. Where most of what is
-    in the balance so low is real, hardly any ray passes through it. So an author is doubted up to
-    the bits below which its nodes that were passed more often than ended in exceed a quarter by the
-    most; up to `MOST_DOUBT` unless `_PRIOR` nodes and more say otherwise. Of a node's
-    witnesses the one doubted least counts.
+    in the balance so low is real, its author has hardly ever looked through it. So an author is
+    doubted up to the bits below which its own rays have denied more than a sixth of its nodes, by
+    the most; up to `MOST_DOUBT` unless `_PRIOR` votes and more say otherwise. Nobody else's rays
+    count, or they could make a robot doubted. Of a node's witnesses the one doubted least counts.
     """
     rung = ((balance - 1) // SIXTEENTHS).clip(0, MOST_DOUBT)
-    says = np.where(found.passed > found.ended, 3, -1)
     sums = np.zeros((authors, MOST_DOUBT + 2), np.int64)  # from the second column on, by rungs
-    for rows, author in _witnesses(first, entries):
-        np.add.at(sums, (author, rung[rows] + 1), says[rows])
+    for rows, at in _witnesses(first, entries):
+        says = np.where(found.denied[at], _DENIED, -1)
+        np.add.at(sums, (entries[at, AUTHOR], rung[rows] + 1), says)
     gain = np.cumsum(sums[:, :-1], axis=1)
     gain[:, MOST_DOUBT] += _PRIOR
-    best = np.argmax(gain, axis=1)
+    best = np.argmax(gain, axis=1)  # the first of equals
     return _least(SIXTEENTHS * best, first, entries)
 
 
 def _least(of_author: Int64s, first: Int32s, entries: Int32s) -> Int64s:
     """(N,) the least of a value (A,) of authors among each node's witnesses."""
     best = np.full(len(first), np.iinfo(np.int64).max)
-    for rows, author in _witnesses(first, entries):
-        best[rows] = np.minimum(best[rows], of_author[author])
+    for rows, at in _witnesses(first, entries):
+        best[rows] = np.minimum(best[rows], of_author[entries[at, AUTHOR]])
     return best
 
 
 def _witnesses(first: Int32s, entries: Int32s) -> Iterator[tuple[npt.NDArray[np.intp], Int32s]]:
-    """Nodes and an author of each: first the newest witnesses, then those before them."""
+    """Nodes and an entry of each: first the newest witnesses, then those before them."""
     rows, at = np.arange(len(first)), first
     while len(rows):
-        yield rows, entries[at, AUTHOR]
+        yield rows, at
         at = entries[at, NEXT]
         rows, at = rows[at >= 0], at[at >= 0]
 

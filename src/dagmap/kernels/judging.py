@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..model import Int32s, Int64s
+from ..model import Bools, Int32s, Int64s
 from .bricks import AUTHOR, END, FIRST, NEXT, NONE, PASS, Bricks, count_at, find_brick
 from .jit import inner, leaf
 from .rays import ceil_sqrt
@@ -96,6 +96,7 @@ def judge(
     part: Int32s,
     touched: Int32s,
     out: Int32s,
+    denied: Bools,
 ) -> None:
     """What the rays say of every node, each author's part bounded by its say.
 
@@ -103,6 +104,7 @@ def judge(
     node. seed, origin, first, entries: see `matching.Nodes`. part: (A, 4) zeros, and zeros again
     afterwards; touched: (A,).
     out: (N, 7) is written: hits, witnesses, against, distance, passed, ended, hidden.
+    denied: (E,) is written: by entry, whether more of the author's own passes than ends are there.
     """
     top, buckets, brick = bricks.top, bricks.buckets, bricks.brick
     bx = by = bz = _NEVER  # the brick of the node before, most often this one's too
@@ -119,6 +121,15 @@ def judge(
         length = ceil_sqrt(dx * dx + dy * dy + dz * dz)
         count = _read_cell(bricks, newest, cz & 7, at, part, touched)
         count = _read_ray(bricks, cell, limit, origin, seed, node, length, part, touched, count)
+        h = w = 0
+        mine = int(first[node])
+        while mine >= 0:
+            author = int(entries[mine, 0])
+            free, ends = int(part[author, PASSED]), int(part[author, ENDED])
+            denied[mine] = min(int(say[2]), free) > min(int(say[2]), ends)
+            h += min(int(say[0]), int(entries[mine, 1]))
+            w += 1
+            mine = int(entries[mine, 3])
         against = passed = ended = hidden = 0
         for k in range(count):
             author = int(touched[k])
@@ -130,12 +141,6 @@ def judge(
             hidden += min(int(say[3]), before)
             for column in range(4):
                 part[author, column] = 0
-        h = w = 0
-        mine = int(first[node])
-        while mine >= 0:
-            h += min(int(say[0]), int(entries[mine, 1]))
-            w += 1
-            mine = int(entries[mine, 3])
         out[node, 0] = h
         out[node, 1] = w
         out[node, 2] = against
