@@ -1,9 +1,9 @@
-"""Section 5: the bytes a second that a robot may send: its share of Eq. (6), and what its link carries.
+"""Section 5: the bytes a second that a robot may send: its share of Eq. (6), and its link.
 
 How fast a link is shows in the tokens that others echo. Bytes that went out before a token arrived
 before it, so their number, over the time from the first of them to the echo, is a rate that the
-link is sure to carry. So a link that has become faster is noticed without trying: the rate goes up as
-far as that shows to fit, and no further.
+link is sure to carry. So a link that has become faster is noticed without trying: the rate goes up
+as far as that shows to fit, and no further.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ _DEEPEST = 64  # the rate is never cut to less than this part of the cap
 _LEAST = 500.0  # bytes/s, nor to less than this: announcements would come too seldom to steer by
 _WORTH = 1.1  # by which the rate must be able to rise before it does
 _HOLD = 100  # cycles after which a link that was full is tried with more, though nothing shows
-_TRIAL = 10  # cycles that such a trial lasts
+_TRIAL = 2  # cycles that such a trial lasts at least
 _ENOUGH = 0.75  # of the longest delay: where it ends, so that it does no harm
-_SETTLE = 10  # longest delays until what a trial put into the link has come out
+_SETTLE = 10  # longest delays, until what goes into a link shows at its other end, and is gone
 _STEP = 1.25  # by which it raises the rate
 _CUT = 0.25  # what is left of the rate where messages take too long, and ever longer
 _LONGEST = 16  # times `_HOLD`: that trials wait for after many that have failed
@@ -171,7 +171,8 @@ class Link:
         elif now >= self._hold:
             full = self._seen[1] - self._used > _FULL * self.rate * (now - self._since)
             self._change(now, _STEP * self.rate if full else self.rate)
-            self._trial = self._hold = now + _TRIAL * period
+            lasts = max(_TRIAL * period, _SETTLE * self._longest)
+            self._trial = self._hold = now + lasts
 
     def _give_up(self, now: float, period: float) -> None:
         """A trial shows that no more fits: back, and not again for long."""
