@@ -25,7 +25,7 @@ class Doubled:
     """Some robots that map all the time; at the step as many join."""
 
     def __init__(self, config: Config, robots: int, features: int, cycles: int) -> None:
-        self.team, period = Team(config), 4.0
+        self.team, period = Team(config), 5.0
         end = (STEP + cycles) * period
         first = self.team.join(robots, period, lambda at: features, end)
         self.team.fleet.advance(STEP * period)
@@ -40,7 +40,7 @@ class Doubled:
                 rates.append(robot.agent.steering.shaper.rate or 0.0)
 
 
-@pytest.mark.parametrize(("robots", "features", "capacity"), [(2, 900, 6_000.0), (3, 800, 9_000.0)])
+@pytest.mark.parametrize(("robots", "features", "capacity"), [(2, 800, 6_000.0), (3, 900, 9_000.0)])
 def test_robots_double(robots: int, features: int, capacity: float) -> None:
     """Eq. (6): the robots share C_Th, however many there are."""
     run = Doubled(steered(fleet_bytes_per_second=capacity), robots, features, LONG + 1)

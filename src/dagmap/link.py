@@ -44,6 +44,7 @@ class Traffic:
         self._fleet = math.inf if fleet is None else fleet
         self._own = math.inf if own is None else own
         self.rate = min(self._fleet / 16, self._own)  # until it is known who else is there
+        self.most = min(self._fleet, self._own)  # bytes/s that no five seconds may exceed
         self._cap = math.inf
         self._first = self._next = -math.inf
         self._fits = 0  # looks in a row at which the share was larger than the cap
@@ -82,6 +83,7 @@ class Traffic:
     def _share(self, robots: int) -> None:
         """Eq. (6): C_Th is shared by the N_G live robots; less at once, more after a while."""
         share = min(self._own, _SHARED * self._fleet / robots)
+        self.most = min(self._own, self._fleet / robots)
         self._fits = self._fits + 1 if share > self._cap else 0
         if share < self._cap or self._fits > _SURE:
             self._cap, self._fits = share, 0

@@ -121,6 +121,11 @@ class Controller:
         """Look at the network: who is there, and how long messages take, s one way."""
         self.rate = self._traffic.look(now, peers, delay, self.period)
 
+    @property
+    def most(self) -> float:
+        """bytes/s that no five seconds may exceed, so that those of all robots keep to C_Th."""
+        return self._traffic.most
+
     def announced(self, now: float, token: int, sent: int) -> None:
         """An announcement goes out now, after so many bytes."""
         if self._limits.caps_bytes:

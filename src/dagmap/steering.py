@@ -22,7 +22,7 @@ class Steering:
     def __init__(self, config: Config, me: AuthorId) -> None:
         self._config, self._me = config, me
         self.controller = Controller(config)
-        self.shaper = Shaper(config.overhead.robot_bytes_per_second)
+        self.shaper = Shaper(self.controller.most)
         self.shaper.rate = self.controller.rate
 
     def insert(
@@ -83,7 +83,7 @@ class Steering:
         """See who is there and how long messages take; send as much as that allows."""
         if self.controller.looks(now, self.shaper.sent):
             self.controller.look(now, sync.live(now), sync.delay(now))
-            self.shaper.rate = self.controller.rate
+            self.shaper.rate, self.shaper.cap = self.controller.rate, self.controller.most
 
     def _encoded(self, message: Message, to: AuthorId | None) -> Outgoing:
         return Outgoing(messages.encode(message, self._config, self._me), to)
