@@ -65,7 +65,9 @@ def folder(text: str) -> Path:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise argparse.ArgumentTypeError(f"{text}: no folder can be made: {error.strerror}") from error
+        raise argparse.ArgumentTypeError(
+            f"{text}: no folder can be made: {error.strerror}"
+        ) from error
     return path
 
 

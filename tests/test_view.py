@@ -406,7 +406,10 @@ class TestCommand:
             ({"folder": tmp_path, "config": tmp_path}, "--config goes with --live"),
             ({"live": "tcp/127.0.0.1:1", "robot": "x"}, "--robot goes with"),
             ({"folder": tmp_path, "points": 3}, "--points 3"),
-            ({"live": "foo"}, r"^--live foo: an endpoint such as \"tcp/192.168.1.7:7447\" is wanted"),
+            (
+                {"live": "foo"},
+                r"^--live foo: an endpoint such as \"tcp/192.168.1.7:7447\" is wanted",
+            ),
         ):
             with pytest.raises(DagmapError, match=said):
                 self.command(**changes).run()
