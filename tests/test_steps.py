@@ -40,7 +40,7 @@ class Doubled:
                 rates.append(robot.agent.steering.shaper.rate or 0.0)
 
 
-@pytest.mark.parametrize(("robots", "features", "capacity"), [(2, 800, 6_000.0), (3, 900, 9_000.0)])
+@pytest.mark.parametrize(("robots", "features", "capacity"), [(2, 800, 6_000.0), (3, 800, 8_000.0)])
 def test_robots_double(robots: int, features: int, capacity: float) -> None:
     """Eq. (6): the robots share C_Th, however many there are."""
     run = Doubled(steered(fleet_bytes_per_second=capacity), robots, features, LONG + 1)
@@ -48,7 +48,7 @@ def test_robots_double(robots: int, features: int, capacity: float) -> None:
     assert all(calm(rates) for rates in run.rates)
     assert min(run.carried[SOON:LONG]) > 0.5 * capacity  # what is allowed is used
     assert not run.team.issued_everything()
-    run.team.fleet.advance(run.team.fleet.now + 900.0)
+    run.team.fleet.advance(run.team.fleet.now + 200.0)
     assert run.team.issued_everything()
     free = Doubled(PLAIN, robots, features, 2 * SOON)
     assert min(free.carried[SOON:]) > capacity
