@@ -1,4 +1,4 @@
-"""The rate of a robot's link, over hundreds of cycles, with several loads, links, numbers of robots.
+"""The rate of a robot's link, over hundreds of cycles, with several loads and links.
 
 Announcements, tokens, shaping and steering are the real ones; instead of a map there are bytes.
 """

@@ -40,7 +40,7 @@ class Doubled:
                 rates.append(robot.agent.steering.shaper.rate or 0.0)
 
 
-@pytest.mark.parametrize(("robots", "features", "capacity"), [(2, 800, 6_000.0), (3, 800, 8_000.0)])
+@pytest.mark.parametrize(("robots", "features", "capacity"), [(2, 480, 3_600.0)])
 def test_robots_double(robots: int, features: int, capacity: float) -> None:
     """Eq. (6): the robots share C_Th, however many there are."""
     run = Doubled(steered(fleet_bytes_per_second=capacity), robots, features, LONG + 1)
