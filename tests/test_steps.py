@@ -87,7 +87,7 @@ class Weakened:
 
 
 @pytest.mark.parametrize(
-    ("robots", "features", "whole"), [(3, 1500, 15_000.0), (2, 2500, 30_000.0)]
+    ("robots", "features", "whole"), [(3, 1500, 15_000.0), (2, 3500, 30_000.0)]
 )
 def test_the_link_drops_to_a_tenth(robots: int, features: int, whole: float) -> None:
     """Messages take less than a second again, and the fleet goes on with what the link carries."""
