@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,12 +21,14 @@ from dagmap.config import IssuanceConfig, OverheadConfig
 from dagmap.equations import Model, Size, Work
 from dagmap.model import DagmapError
 from dagmap.steering import Steering
+from dagmap.sync import Echo, Peer
 from scenes import surface
 
 Row = dict[str, Any]
 FEATURES = 1000  # N_f: of a cycle
 LEARNT = 10_000  # n(U) up to which the models are fitted; beyond they predict
 WANTED = (1, 8, 64)  # V_th
+PEERS = (0, 3, 30)  # of the robot whose steering is measured
 OUT = Path("out/overhead")
 
 
@@ -73,33 +75,41 @@ class Seen(NamedTuple):
     seconds: float
 
 
-def fly(most: int, n_c: int, others: int = 1) -> list[Seen]:
-    """Cycles of a robot that maps until n(U) = most, and merges what so many others map."""
+def fly(most: int, n_c: int, others: int = 1, apart: bool = False) -> list[Seen]:
+    """Cycles of a robot that maps until n(U) = most, and merges what so many others map.
+
+    apart: it sends in every other cycle only, and merges in every third, so that the costs of
+    inserting, sending and merging can be told apart.
+    """
     robots = [Robot(1 + i, n_c) for i in range(1 + others)]
-    said: list[list[bytes]] = [[] for _ in robots]
+    first, views = robots[0], zip(*(cycles(most, 1 + i) for i in range(1 + others)), strict=True)
+    heard: list[bytes] = []
     seen = []
-    for now, views in enumerate(
-        zip(*(cycles(most, 1 + i) for i in range(1 + others)), strict=True)
-    ):
-        heard = [message for messages in said[1:] for message in messages]
-        for i, robot in enumerate(robots):
-            said[i], cost = robot.work(views[i], heard if i == 0 else [], float(now))
-            if i == 0 and now:  # before there is nothing to merge
-                seen.append(cost)
+    for now, (own, *theirs) in enumerate(views):
+        first.agent.listening = apart and now % 2 == 0  # then nothing is issued
+        messages, heard = ([], heard) if apart and now % 3 else (heard, [])
+        seen.append(first.work(own, messages, float(now))[1])
+        for robot, cycle in zip(robots[1:], theirs, strict=True):
+            heard = heard + robot.work(cycle, [], float(now))[0]
     return seen
 
 
 def predicted(
     flights: dict[tuple[int, int], list[Seen]],
     learn: Callable[..., bool],
+    lessons: Iterable[Seen],
     further: Sequence[int] = (),
 ) -> list[Row]:
     """A row for decades of n(U) of each flight (N_c, N_G), and what both models make of it.
 
     learn: whether a cycle (n(U), N_c, N_G) is one that the models are fitted to.
+    lessons: cycles beside these that they are fitted to, too.
     further: n(U) beyond a single flight, for which there is a prediction only.
     """
     models = {as_printed: Model(as_printed) for as_printed in (True, False)}
+    for each in lessons:
+        for model in models.values():
+            model.add(*each)
     for (n_c, n_g), seen in flights.items():
         for each in seen:
             if learn(each.size.n_u, n_c, n_g):
@@ -110,7 +120,8 @@ def predicted(
         picks = np.unique(np.geomspace(1, len(seen), 10).astype(int) - 1)
         for i in picks if len(flights) == 1 else [len(seen) - 1]:
             work, size, _ = seen[i]
-            around = [each.seconds for each in seen[max(0, i - 4) : i + 5]]
+            alike = seen[max(1, i - 4) : i + 5] if i else seen[:1]  # the first has nothing to merge
+            around = [each.seconds for each in alike]
             row = {"n_u": size.n_u, "n_c": n_c, "n_g": n_g, "learnt": learn(size.n_u, n_c, n_g)}
             row["measured_ms"] = 1e3 * float(np.median(around))
             rows.append(row | _by_models(models, work, size))
@@ -152,35 +163,49 @@ def completion(n_c: int, v_th: int, count: int = 40) -> Row:
     }
 
 
-def steering(period: float = 1.0, ticks: int = 20, count: int = 300) -> Row:
-    """What the controller and the model take of a cycle of so many seconds."""
+def steering(peers: int, period: float = 1.0, ticks: int = 20, count: int = 300) -> Row:
+    """What the controller and the model take of a cycle of so many seconds, with so many peers."""
     limits = OverheadConfig(fleet_bytes_per_second=1e5, cycle_share=0.8)
     limited = msgspec.structs.replace(config(), overhead=limits)
     agent = Agent(Identity.from_seed(bytes(32)), limited)
-    steered = Steering(limited, agent.identity.author)
-    started = time.process_time()
+    steered, others = Steering(limited, agent.identity.author), agent.sync.peers
+    spent = 0.0
     for i in range(count):
+        echo = Echo(i, 0.01, i * period)
+        others.update({bytes([n]) * 8: Peer({}, i, i * period, echo=echo) for n in range(peers)})
+        started = time.process_time()
         steered.controller.work.inserted += 1000
+        steered.controller.work.merged += 1000 * peers
         steered.controller.took(0.1)
         steered.controller.cycle(i * period, 1000 * i, 0, 0)
+        steered.controller.announced(i * period, i, steered.shaper.sent)
         for tick in range(ticks):
             now = (i + tick / ticks) * period
             steered.look(agent.sync, now)
             steered.allowance(now)
             steered.shaper.release(now)
-    spent = (time.process_time() - started) / count
-    return {"name": "steering", "ms_a_cycle": 1e3 * spent, "share_of_a_1_s_cycle": spent / period}
+        spent += time.process_time() - started
+    cost = 1e3 * spent / count
+    return {
+        "name": "steering",
+        "peers": peers,
+        "ms_a_cycle": cost,
+        "share_of_a_1_s_cycle": cost / 1e3 / period,
+    }
 
 
 def measure(most: int, further: Sequence[int] = ()) -> dict[str, list[Row]]:
     """Cycles against n(U), N_c and N_G; see `predicted`."""
     fly(4000, 2)  # compiled and warm
+    lessons = fly(LEARNT, 2, apart=True)
     degrees = {(n_c, 2): fly(min(most, 10_000), n_c) for n_c in (2, 3, 4, 6, 8)}
     fleets = {(2, 1 + n): fly(min(most, 4_000), 2, n) for n in (1, 3, 7, 15, 31)}
     return {
-        "n_u": predicted({(2, 2): fly(most, 2)}, lambda n_u, n_c, n_g: n_u <= LEARNT, further),
-        "n_c": predicted(degrees, lambda n_u, n_c, n_g: n_c <= 3),
-        "n_g": predicted(fleets, lambda n_u, n_c, n_g: n_g <= 4),
+        "n_u": predicted(
+            {(2, 2): fly(most, 2)}, lambda n_u, n_c, n_g: n_u <= LEARNT, lessons, further
+        ),
+        "n_c": predicted(degrees, lambda n_u, n_c, n_g: n_c <= 3, lessons),
+        "n_g": predicted(fleets, lambda n_u, n_c, n_g: n_g <= 4, lessons),
     }
 
 
@@ -195,7 +220,7 @@ def run(most: int | None = None) -> list[Row]:
     (OUT / "overhead.json").write_text(json.dumps(found, indent=1) + "\n")
     draw(found, OUT / "overhead.png")
     written = {"written": ", ".join(sorted(str(path) for path in OUT.glob("overhead.*")))}
-    return [*rows, steering(), written]
+    return [*rows, *(steering(peers) for peers in PEERS), written]
 
 
 def _asked() -> int:

@@ -111,4 +111,4 @@ def draw(path: Path, reports: dict[str, Report]) -> None:
 
 
 if __name__ == "__main__":
-    common.main(run, ("seconds", float, SECONDS, "length of each mission"))
+    common.main(run, ("seconds", float, SECONDS, 6.0, 3600.0, "length of each mission"))

@@ -5,7 +5,6 @@ Each is a process of its own, so that one that fails does not take the others wi
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
@@ -41,9 +40,14 @@ def one(name: str, out: Path) -> tuple[str, int, str, float]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=common.OUT, help="folder for JSON and PNG")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time")
+    parser = common.Parser(description=__doc__)
+    parser.add_argument(
+        "--out", type=common.folder, default=str(common.OUT), help="folder for JSON and PNG"
+    )
+    jobs = common.between(int, 1, 1000)
+    parser.add_argument(
+        "--jobs", type=jobs, default=os.cpu_count() or 1, help="processes at a time"
+    )
     options = parser.parse_args()
     started = time.perf_counter()
     warm_up(Console(stderr=True))  # once, for all of them

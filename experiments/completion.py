@@ -145,4 +145,4 @@ def draw(path: Path, scenes: dict[str, list[Row]]) -> None:
 
 
 if __name__ == "__main__":
-    common.main(run, ("cycles", int, 40, "cycles before the wall"))
+    common.main(run, ("cycles", int, 40, 10, 10_000, "cycles before the wall"))

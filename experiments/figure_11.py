@@ -56,6 +56,6 @@ def sentence(row: Row) -> str:
 if __name__ == "__main__":
     common.main(
         run,
-        ("seconds", float, 3600.0, "length of the simulated mission"),
-        ("points", int, 400, "points of a cycle"),
+        ("seconds", float, 3600.0, 20.0, 86_400.0, "length of the simulated mission"),
+        ("points", int, 400, 1, 100_000, "points of a cycle"),
     )

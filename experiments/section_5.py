@@ -63,4 +63,4 @@ def draw(path: Path, found: dict[str, list[Row]]) -> None:
 
 
 if __name__ == "__main__":
-    common.main(run, ("most", int, 1_000_000, "n(U) up to which it is measured"))
+    common.main(run, ("most", int, 1_000_000, 3_000, 10_000_000, "n(U) up to which it is measured"))

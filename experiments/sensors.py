@@ -105,4 +105,4 @@ def draw(path: Path, cases: list[Row]) -> None:
 
 
 if __name__ == "__main__":
-    common.main(run, ("seconds", float, 30.0, "length of the missions"))
+    common.main(run, ("seconds", float, 30.0, 5.0, 3600.0, "length of the missions"))

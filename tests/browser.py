@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 from urllib.request import ProxyHandler, build_opener
 
 import pytest
@@ -43,6 +43,13 @@ _FLAGS = (
     "--mute-audio",
     "--remote-debugging-port=0",
 )
+
+
+def without(reason: str) -> NoReturn:
+    """No browser: a test is skipped and says why; where one was promised, it fails."""
+    if os.environ.get("DAGMAP_BROWSER") == "required":
+        pytest.fail(f"{reason}, and DAGMAP_BROWSER=required says that there is one")
+    pytest.skip(reason)
 
 
 def find_browser() -> str | None:
@@ -112,10 +119,10 @@ class Browser:
 
 @contextmanager
 def open_browser(width: int = 1000, height: int = 700) -> Iterator[Browser]:
-    """A browser with an empty page; skips the test where none is installed, or none that draws."""
+    """A browser with an empty page; see `without` for where none is, or none that draws."""
     path = find_browser()
     if path is None:
-        pytest.skip(f"no browser is installed (one of {', '.join(_NAMES)})")
+        without(f"no browser is installed (one of {', '.join(_NAMES)})")
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         process = subprocess.Popen(
             [path, *_FLAGS, f"--window-size={width},{height}", f"--user-data-dir={profile}",
@@ -129,7 +136,7 @@ def open_browser(width: int = 1000, height: int = 700) -> Iterator[Browser]:
             with connect(_page(port), max_size=None, compression=None, proxy=None) as connection:
                 browser = Browser(connection)
                 if not browser.run("!!document.createElement('canvas').getContext('webgl2')"):
-                    pytest.skip(f"{path} cannot draw in three dimensions here")
+                    without(f"{path} cannot draw in three dimensions here")
                 yield browser
         finally:
             with suppress(ProcessLookupError):
@@ -142,7 +149,7 @@ def _port(profile: Path, process: subprocess.Popen[bytes]) -> int:
 
     def look() -> int | None:
         if process.poll() is not None:
-            pytest.skip(f"the browser does not start here: it ended with {process.returncode}")
+            without(f"the browser does not start here: it ended with {process.returncode}")
         file = profile / "DevToolsActivePort"
         lines = file.read_text().splitlines() if file.exists() else []
         return int(lines[0]) if len(lines) > 1 else None

@@ -2,104 +2,16 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Callable, Iterator
-from itertools import pairwise
-
 import msgspec
 import numpy as np
 import pytest
 
-from dagmap import Agent, Config, Cycle, GraphConfig, Issued, Overloaded
-from dagmap.config import IssuanceConfig, OverheadConfig, TransactionConfig
-from dagmap.sim.fleet import Fleet
-from dagmap.sim.network import Link, Network
-from dagmap.sim.robot import Costs, Happening, Robot, Timed
+from dagmap import Agent, Config, Cycle, Issued, Overloaded
+from dagmap.config import IssuanceConfig, OverheadConfig
+from dagmap.sim.network import Link
+from dagmap.sim.robot import Costs
 from scene import agent
-
-PLAIN = Config(
-    transaction=TransactionConfig(proof_of_work_bits=0),
-    graph=GraphConfig(reference_pitch=0.25, max_parent_distance=0.75),
-    issuance=IssuanceConfig(repeats=0),
-)
-TICK = 0.2
-
-
-class Corridor:
-    """A robot that sees so many new points every cycle, none of them twice."""
-
-    def __init__(self, seed: int, period: float, count: Callable[[float], int], end: float) -> None:
-        self.seed, self.period, self.count, self.end = seed, period, count, end
-
-    def cycles(self, start: float, session: int) -> Iterator[Timed]:
-        rng, number, at = np.random.default_rng(self.seed), 0, start
-        while at < self.end:
-            pose = np.eye(4)
-            pose[:3, 3] = 0.5 * number, 10.0 * self.seed, 0.0
-            points = rng.uniform([0, -2, -1], [2, 2, 1], (self.count(at), 3))
-            yield at, Cycle(stamp=at, pose=pose, points=points)
-            number, at = number + 1, at + self.period
-
-
-class Team:
-    """A fleet whose traffic and load are watched."""
-
-    def __init__(
-        self, config: Config, link: Link | None = None, costs: Costs | None = None
-    ) -> None:
-        self.sent: dict[str, list[tuple[float, int]]] = defaultdict(list)
-        self.events: list[Overloaded] = []
-        self.network = Network(link or Link(), 1)
-        self.fleet = Fleet(config, self.network, self._note, tick=TICK, costs=costs)
-        plain = self.network.send
-
-        def send(sender: str, receivers: object, size: int, now: float) -> object:
-            self.sent[sender].append((now, size))
-            return plain(sender, receivers, size, now)  # type: ignore[arg-type]
-
-        self.network.send = send  # type: ignore[method-assign, assignment]
-
-    def _note(self, robot: Robot, happening: Happening) -> None:
-        if isinstance(happening, Overloaded):
-            self.events.append(happening)
-
-    def join(
-        self, number: int, period: float, count: Callable[[float], int], end: float
-    ) -> list[Robot]:
-        first = len(self.fleet.robots)
-        robots = []
-        for i in range(first, first + number):
-            robots.append(self.fleet.join(f"r{i}"))
-            self.fleet.play(f"r{i}", Corridor(i, period, count, end))
-        return robots
-
-    def bytes_in(self, start: float, end: float) -> int:
-        """Bytes that all robots put on the network."""
-        return sum(size for out in self.sent.values() for at, size in out if start <= at < end)
-
-    def issued_everything(self) -> bool:
-        """Whether all that any SLAM put out has gone out and is known to everybody."""
-        robots = list(self.fleet.robots.values())
-        everything = all(robot.issued == robot.observed for robot in robots)
-        return everything and self.fleet.agrees()
-
-
-def steered(**limits: float) -> Config:
-    return msgspec.structs.replace(PLAIN, overhead=OverheadConfig(**limits))  # type: ignore[arg-type]
-
-
-def worst_window(out: list[tuple[float, int]], span: float = 5.0) -> int:
-    """The most bytes in any span of time."""
-    at, size = np.array([t for t, _ in out]), np.array([s for _, s in out])
-    total = np.concatenate([[0], np.cumsum(size)])
-    before = np.searchsorted(at, at - span + 1e-9, "right")
-    return int((total[1:] - total[before]).max())
-
-
-def turns(values: list[float]) -> int:
-    """How often a series changes its direction."""
-    steps = [b > a for a, b in pairwise(values) if a != b]
-    return sum(a != b for a, b in pairwise(steps))
+from team import PLAIN, Team, steered, worst_window
 
 
 def peak_to_mean(pairs: list[tuple[float, int]], seconds: int) -> float:
@@ -223,85 +135,6 @@ def test_what_is_new_to_the_fleet_goes_first() -> None:
     for second in range(2, 7):
         a.tick(float(second))
     assert a.ledger.features(a.identity.author) == 600
-
-
-def test_robots_double_and_the_fleet_stays_under_its_capacity() -> None:
-    """Eq. (6): the robots share C_Th, however many there are."""
-    capacity, period = 10_000.0, 4.0
-
-    def fly(config: Config, cycles: int) -> Team:
-        team = Team(config)
-        first = team.join(3, period, lambda at: 900, 60.0)
-        team.fleet.advance(40.0)
-        rates.append(first[0].agent.steering.shaper.rate or 0.0)
-        team.join(3, period, lambda at: 900, 60.0)
-        for cycle in range(cycles):
-            team.fleet.advance(40.0 + period * (cycle + 1))
-            rates.append(first[0].agent.steering.shaper.rate or 0.0)
-        return team
-
-    rates: list[float] = []
-    team = fly(steered(fleet_bytes_per_second=capacity), 100)
-    for start in np.arange(40.0 + 10 * period, 440.0, period):
-        assert team.bytes_in(start, start + period) <= capacity * period
-    assert rates[0] == pytest.approx(2 * rates[-1]) and turns(rates) <= 1
-    assert team.issued_everything()
-    free = fly(PLAIN, 5)
-    busy = [free.bytes_in(at, at + period) for at in (44.0, 48.0, 52.0)]
-    assert min(busy) > capacity * period
-
-
-def test_a_link_that_drops_to_a_tenth_is_relieved() -> None:
-    period, whole = 5.0, 15_000.0
-
-    def fly(config: Config, cycles: int) -> tuple[Team, list[float], list[float]]:
-        team = Team(config, Link(bandwidth=whole, queue=1 << 30))
-        first = team.join(3, period, lambda at: 1500, 150.0)[0]
-        team.fleet.advance(50.0)
-        team.network.link = Link(bandwidth=whole / 10, queue=1 << 30)
-        delays, rates = [], []
-        for cycle in range(cycles):
-            team.fleet.advance(50.0 + period * (cycle + 1))
-            delays.append(first.agent.sync.delay(team.fleet.now) or 0.0)
-            rates.append(first.agent.steering.shaper.rate or 0.0)
-        return team, delays, rates
-
-    team, delays, rates = fly(steered(robot_bytes_per_second=7_500.0), 100)
-    assert max(delays[10:]) <= 1.0
-    assert whole / 100 < rates[10] < whole / 10 and turns(rates) <= 1
-    team.network.link = Link(bandwidth=whole, queue=1 << 30)
-    team.fleet.advance(team.fleet.now + 250.0)
-    assert team.issued_everything()
-    _, delays, _ = fly(PLAIN, 12)
-    assert min(delays[9:]) > 5.0
-
-
-def test_a_slam_that_trebles_its_features_does_not_take_the_cycle() -> None:
-    """S < T, Eq. (2): N_c, then N'_f, then what a cycle inserts, and a warning."""
-    costs, share = Costs(inserted=1.5e-3, sent=0.5e-3, merged=0.2e-3), 0.8
-
-    def count(at: float) -> int:
-        return 600 if 20.0 <= at < 45.0 else 200
-
-    def fly(config: Config, cycles: int) -> tuple[Team, list[float], list[float]]:
-        team = Team(config, costs=costs)
-        first = team.join(3, 1.0, count, 160.0)[0]
-        loads, features = [], []
-        for cycle in range(cycles):
-            team.fleet.advance(1.0 * cycle + 0.5)
-            controller = first.agent.steering.controller
-            loads.append(controller.load)
-            features.append(float(controller.features or 1 << 20))
-        return team, loads, features
-
-    team, loads, features = fly(steered(cycle_share=share), 140)
-    assert max(loads[30:]) <= share < max(loads[20:30])  # ten cycles after the step
-    assert team.events and team.events[0].features is not None and team.events[0].load > share
-    assert turns(features[20:120]) <= 1
-    team.fleet.advance(300.0)
-    assert team.issued_everything()
-    _, loads, _ = fly(PLAIN, 45)
-    assert min(loads[22:44]) > 1.0
 
 
 def test_nothing_is_limited_unless_it_is_asked_for() -> None:

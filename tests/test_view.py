@@ -406,6 +406,10 @@ class TestCommand:
             ({"folder": tmp_path, "config": tmp_path}, "--config goes with --live"),
             ({"live": "tcp/127.0.0.1:1", "robot": "x"}, "--robot goes with"),
             ({"folder": tmp_path, "points": 3}, "--points 3"),
+            (
+                {"live": "foo"},
+                r"^--live foo: an endpoint such as \"tcp/192.168.1.7:7447\" is wanted",
+            ),
         ):
             with pytest.raises(DagmapError, match=said):
                 self.command(**changes).run()
@@ -437,8 +441,14 @@ class TestLive:
         found = {each.robot: each for each in standings(ada, announced, "d1")}
         assert found["bob"] == Standing("bob", "d1", True, "the same transactions")
         assert found["31"].agrees is False and found["31"].detail.endswith(" behind")
-        assert found["32"] == Standing("32", "", False, "another branch")
-        assert found["33"] == Standing("33", "", False, "3 ahead")
+        assert (found["32"].agrees, found["32"].detail) == (False, "another branch")
+        assert (found["33"].agrees, found["33"].detail) == (False, "3 ahead")
+        shown = [found[name].digest for name in ("31", "32", "33")]  # each by its own heads
+        assert len(set(shown)) == 3 and all(digest.startswith("heads ") for digest in shown)
+        again = standings(ada, {b"4": dict(reversed(less.items()))}, "d1")
+        assert again[0].digest == found["31"].digest
+        html = words.standing("a fleet", list(found.values()), "d1", "")
+        assert all(digest[:18] in html for digest in shown)
 
     def test_follows_a_running_robot(self, nursery: Nursery, tmp_path: Path) -> None:
         robot = Robot(nursery, tmp_path, "ada", record(tmp_path / "walk.npz", seed=1))

@@ -108,3 +108,13 @@ def test_the_ledger_runs_in_the_browser(run: Path) -> None:
         wait_for(lambda: controls.counts.content == whole, "all nodes again")
         assert int(controls.slider.value) == count
         assert browser.frames_per_second(0.5) > 0
+
+
+def test_a_browser_that_was_promised_may_not_be_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setenv("DAGMAP_BROWSER", "required")
+    with pytest.raises(pytest.fail.Exception, match="no browser is installed"), open_browser():
+        pass
+    monkeypatch.delenv("DAGMAP_BROWSER")
+    with pytest.raises(pytest.skip.Exception, match="no browser is installed"), open_browser():
+        pass

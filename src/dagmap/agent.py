@@ -165,7 +165,7 @@ class Agent:
         events += self._issue(now)
         events += self._fold_on(now)
         self.observing.relate(*self.placing.step(self.ledger, self.consensus))
-        self.steering.announce(self.sync.tick(now, unread), now)
+        self.steering.announce(self.sync, now, unread)
         self.steering.shaper.release(now)
         return events
 

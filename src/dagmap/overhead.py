@@ -6,30 +6,23 @@ is decided here decides nothing that others depend on, so it may use floating po
 
 from __future__ import annotations
 
-import math
-from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import replace
 
-import numpy as np
-
 from .config import Config
 from .equations import Model, Size, Work
+from .link import Traffic
 from .model import AuthorId, Event, Overloaded
-from .sync import Echo, Peer
+from .sync import Peer
 
 _AIM = 0.8  # of a limit: where a cut aims, so that the next cycle does not need another
-_CALM = 0.5  # of a limit: below it something may be given back
 _GIVE_BACK = 1.25  # by which a lever is given back a cycle
+_CALM = _AIM / _GIVE_BACK  # of a limit: below it that fits, since S grows no faster than the work
 _REST = 20  # calm cycles in a row before anything is given back
-_HOLD = 100  # cycles before a link that was full is tried with more
+_SURE = 2  # cycles over the limit in a row before anything is cut: one may be a hiccup
 _TRIES = 2  # cuts of N'_f before features per cycle are cut
-_SHARED = 0.9  # of C_Th that is shared out: buckets may fill at one time
-_LISTEN = 2  # announcement periods in which a newcomer says little
-_SURE = 10  # looks in a row at which a larger share must have been due
 _FEWEST = 64  # features a cycle that are always let through
 _PASS = 3e-7  # s a node that a change of N_c costs: it looks at all of them
-_DEEPEST = 64  # the rate is never cut to less than this part of the cap
 _SIZE = 12.0  # bytes of a feature on the wire, until they were measured
 
 
@@ -38,7 +31,7 @@ class Controller:
 
     S, against the cycle time: N_c first, then N'_f, and the features that a cycle inserts last.
     Traffic: the robot's share of C_Th, or less where the echoed tokens say that the link is slow.
-    Each is cut at once, and given back slowly once there has been room for long.
+    Each is cut soon, and given back once there has long been room for what that will cost.
     """
 
     def __init__(self, config: Config) -> None:
@@ -54,9 +47,9 @@ class Controller:
         self._spent = 0.0
         self._before = Work()
         self._cycle_at: float | None = None
-        self._calm = self._tries = self._dropped = 0
+        self._calm = self._over = self._tries = self._dropped = 0
         self._size = _SIZE
-        self._traffic = _Traffic(config)
+        self._traffic = Traffic(config)
         if self._limits.caps_bytes:
             self.rate = self._traffic.rate
 
@@ -117,14 +110,26 @@ class Controller:
             found.append(int(self.rate * self.period / self._size))
         return max(1, min(found))
 
+    def looks(self, now: float, sent: int) -> bool:
+        """Whether it is time to look at the network. sent: bytes let out so far."""
+        if not self._limits.caps_bytes:
+            return False
+        self._traffic.sent(now, sent)
+        return self._traffic.due(now)
+
     def look(self, now: float, peers: Mapping[AuthorId, Peer], delay: float | None) -> None:
         """Look at the network: who is there, and how long messages take, s one way."""
         self.rate = self._traffic.look(now, peers, delay, self.period)
 
-    def announced(self, token: int, sent: int) -> None:
-        """An announcement went out after so many bytes."""
+    @property
+    def most(self) -> float:
+        """bytes/s that no five seconds may exceed, so that those of all robots keep to C_Th."""
+        return self._traffic.most
+
+    def announced(self, now: float, token: int, sent: int) -> None:
+        """An announcement goes out now, after so many bytes."""
         if self._limits.caps_bytes:
-            self._traffic.announced(token, sent)
+            self._traffic.announced(now, token, sent)
 
     def _close(self, period: float, nodes: int, waiting: int, dropped: int) -> list[Event]:
         spent, self._spent = self._spent, 0.0
@@ -136,9 +141,11 @@ class Controller:
         if share is None:
             return []
         before = self.features
-        if self.load > share:
-            self._calm = 0
+        self._over = self._over + 1 if self.load > share else 0
+        if self._over >= _SURE:
             self._cut(self.load / share, done, nodes * _PASS < 0.1 * period)
+        if self._over:
+            self._calm = 0
         else:
             self._calm = self._calm + 1 if self.load < _CALM * share else 0
             if self._calm > _REST:
@@ -171,85 +178,3 @@ class Controller:
             self._tries = 0 if free else self._tries
         elif self.n_c > self._config.graph.n_c:
             self.n_c, self._calm, self._tries = self.n_c - 1, 0, 0
-
-
-class _Traffic:
-    """The bytes a second that a robot may send: Eq. (6), and what its link is seen to carry."""
-
-    def __init__(self, config: Config) -> None:
-        self._limits, self._every = config.overhead, config.sync.announce_period
-        fleet, own = self._limits.fleet_bytes_per_second, self._limits.robot_bytes_per_second
-        self._fleet = math.inf if fleet is None else fleet
-        self._own = math.inf if own is None else own
-        self.rate = min(self._fleet / 16, self._own)  # until it is known who else is there
-        self._cap = self._link = math.inf
-        self._first = self._next = -math.inf
-        self._fits = 0  # looks in a row at which the share was larger than the cap
-        self._delay = 0.0
-        self._congested, self._hold = False, -math.inf
-        self._said: OrderedDict[int, int] = OrderedDict()  # bytes sent before each token
-        self._echoes: dict[AuthorId, Echo] = {}
-        self._carried: list[float] = []  # bytes/s of the link, as the echoes tell
-
-    def announced(self, token: int, sent: int) -> None:
-        self._said[token] = sent
-        while len(self._said) > 64:
-            self._said.popitem(last=False)
-
-    def look(
-        self,
-        now: float,
-        peers: Mapping[AuthorId, Peer],
-        delay: float | None,
-        period: float | None,
-    ) -> float:
-        """The rate from now on. period: T, s."""
-        if now < self._next:
-            return self.rate
-        if self._first == -math.inf:
-            self._first = now
-        self._next = now + self._every
-        if self._fleet < math.inf and now < self._first + _LISTEN * self._every:
-            return self.rate  # first hear who is there
-        self._share(1 + len(peers))
-        self._measure(peers)
-        self._relieve(now, delay, period or self._every)
-        self.rate = min(self._cap, self._link)
-        return self.rate
-
-    def _share(self, robots: int) -> None:
-        """Eq. (6): C_Th is shared by the N_G live robots; less at once, more after a while."""
-        share = min(self._own, _SHARED * self._fleet / robots)
-        self._fits = self._fits + 1 if share > self._cap else 0
-        if share < self._cap or self._fits > _SURE:
-            self._cap, self._fits = share, 0
-
-    def _measure(self, peers: Mapping[AuthorId, Peer]) -> None:
-        """What came over the link between two tokens, where it was full."""
-        for author, peer in peers.items():
-            echo, before = peer.echo, self._echoes.get(author)
-            if echo is None or (before is not None and before.token == echo.token):
-                continue
-            self._echoes[author] = echo
-            if before is None or min(before.delay, echo.delay) <= self._limits.longest_delay:
-                continue
-            if echo.at > before.at and {echo.token, before.token} <= self._said.keys():
-                size = self._said[echo.token] - self._said[before.token]
-                self._carried.append(size / (echo.at - before.at))
-        self._echoes = {author: e for author, e in self._echoes.items() if author in peers}
-
-    def _relieve(self, now: float, delay: float | None, period: float) -> None:
-        """Send less where messages take too long; more again after a long time without that."""
-        before, self._delay = self._delay, delay or 0.0
-        least = self._cap / _DEEPEST
-        if self._delay > self._limits.longest_delay:
-            if self._delay >= before:
-                self._link = max(least, min(self._link, self._cap) / 2)
-            self._congested = True
-        elif self._congested:
-            self._congested, self._hold = False, now + _HOLD * period
-            if self._carried:
-                self._link = max(self._link, _AIM * float(np.median(self._carried)))
-            self._carried.clear()
-        elif self._link < self._cap and now >= self._hold:
-            self._link, self._hold = _GIVE_BACK * self._link, now + period

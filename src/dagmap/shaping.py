@@ -31,12 +31,12 @@ class Urgency(IntEnum):
 class Shaper:
     """The way out. Without a rate everything passes at once.
 
-    cap: bytes/s that no span of `WINDOW` seconds exceeds; the rate may be less, and change.
+    cap: bytes/s that no span of `WINDOW` seconds exceeds; the rate may be less. Both may change.
     """
 
-    def __init__(self, cap: float | None = None) -> None:
+    def __init__(self, cap: float = float("inf")) -> None:
         self.rate: float | None = None  # bytes/s
-        self._most = float("inf") if cap is None else WINDOW * cap  # bytes in a window
+        self.cap = cap
         self.sent = 0  # bytes let out so far
         self._out: list[Outgoing] = []
         self._queues: tuple[deque[Outgoing], ...] = tuple(deque() for _ in Urgency)
@@ -110,6 +110,11 @@ class Shaper:
         if any(out.to == to for out in queue):
             return 0
         return max(0, int(self._depth) - sum(len(out.data) for out in queue))
+
+    @property
+    def _most(self) -> float:
+        """Bytes in a window."""
+        return WINDOW * self.cap
 
     @property
     def _yields(self) -> bool:

@@ -22,7 +22,7 @@ class Steering:
     def __init__(self, config: Config, me: AuthorId) -> None:
         self._config, self._me = config, me
         self.controller = Controller(config)
-        self.shaper = Shaper(config.overhead.robot_bytes_per_second)
+        self.shaper = Shaper(self.controller.most)
         self.shaper.rate = self.controller.rate
 
     def insert(
@@ -68,20 +68,22 @@ class Steering:
         for post in posts:
             self.shaper.put(self._encoded(*post), urgency)
 
-    def announce(self, posts: Iterable[Post], now: float) -> None:
+    def announce(self, sync: Sync, now: float, unread: bool) -> None:
         """Announcements, and questions for what is lacking."""
-        found = list(posts)
+        found = list(sync.tick(now, unread))
         heads = [message for message, _ in found if isinstance(message, Heads)]
         said = [self._encoded(message, None) for message in heads]
         if said and self.shaper.announce(said, now):
-            self.controller.announced(heads[0].token, self.shaper.sent)
+            self.controller.announced(now, heads[0].token, self.shaper.sent)
+        elif said:
+            sync.unsaid(heads[0].token)
         self.post((post for post in found if not isinstance(post[0], Heads)), Urgency.CONTROL)
 
     def look(self, sync: Sync, now: float) -> None:
         """See who is there and how long messages take; send as much as that allows."""
-        if self._config.overhead.caps_bytes:
+        if self.controller.looks(now, self.shaper.sent):
             self.controller.look(now, sync.live(now), sync.delay(now))
-            self.shaper.rate = self.controller.rate
+            self.shaper.rate, self.shaper.cap = self.controller.rate, self.controller.most
 
     def _encoded(self, message: Message, to: AuthorId | None) -> Outgoing:
         return Outgoing(messages.encode(message, self._config, self._me), to)

@@ -27,6 +27,7 @@ _HEADS = 1800  # that a message has room for
 _ROOM = MAX_MESSAGE - 64  # for transactions in a message
 _SMALL = 2048  # bytes for transactions in a message of a robot whose traffic is capped
 _LIVE = 5  # announcement periods without a word after which a robot counts as gone
+_SELDOM = 20  # announcement periods that a robot with little room may let pass between two
 _LATE = 3  # announcement periods that an echo may take before that means something
 _UNREAD = 8  # retry periods that an answer gets on top while messages wait to be read
 _WIDEST = 64  # robots that are asked the same at a time, once nobody keeps what was promised
@@ -40,6 +41,7 @@ class Peer:
     heads: dict[AuthorId, Head] = field(default_factory=dict)
     token: int = 0
     heard: float = 0.0
+    gap: float = 0.0  # s between its last two announcements
     delay: float | None = None  # s, one way, smoothed
     echo: Echo | None = None  # the last one
     gave: bool = False  # transactions that were lacking here; and no question since was in vain
@@ -99,6 +101,7 @@ class Sync:
         peer = self._peer(sender)
         if message.token != peer.token:
             peer.heads.clear()  # an announcement of several messages has one token
+            peer.gap = now - peer.heard if peer.token else 0.0
         peer.token, peer.heard = message.token, now
         self._held()
         waiting, held = self._ledger.waiting_from(), self._ends
@@ -141,9 +144,17 @@ class Sync:
         return any(head is not None and self._wanted(head, {}) is not None for head in heads)
 
     def live(self, now: float) -> dict[AuthorId, Peer]:
-        """The robots that were heard of late."""
-        since = now - _LIVE * self._config.announce_period
-        return {author: peer for author, peer in self.peers.items() if peer.heard >= since}
+        """The robots that were heard of late: one with little room announces itself seldom."""
+        period = self._config.announce_period
+        return {
+            author: peer
+            for author, peer in self.peers.items()
+            if now - peer.heard <= _LIVE * min(max(period, peer.gap), _SELDOM * period)
+        }
+
+    def unsaid(self, token: int) -> None:
+        """An announcement was left out, so nobody will echo its token."""
+        self._sent_at.pop(token, None)
 
     def delay(self, now: float) -> float | None:
         """What a message from here takes at least, s one way; None where nobody knows.
@@ -151,14 +162,15 @@ class Sync:
         Measured by the tokens that the others echo; where none came back for long, by how long.
         That of the nearest robot: a slow link of another one is not this one's to relieve.
         """
-        period = self._config.announce_period
-        echoes = [peer.echo for peer in self.live(now).values() if peer.echo is not None]
+        live = self.live(now).values()
+        echoes = [peer.echo for peer in live if peer.echo is not None]
         if not echoes:
             return None
         last = max(echo.token for echo in echoes)
         fresh = [echo.delay for echo in echoes if echo.token > last - _LIVE]
-        unechoed = self._sent_at.get(last + 1, now)
-        overdue = (now - unechoed - _LATE * period) / 2
+        unechoed = next((at for token, at in self._sent_at.items() if token > last), now)
+        usual = max(self._config.announce_period, min(peer.gap for peer in live))
+        overdue = (now - unechoed - _LATE * usual) / 2
         return max(min(fresh), overdue)
 
     def asked(self, sender: AuthorId, message: Want, room: int | None = None) -> Iterator[Post]:

@@ -6,6 +6,7 @@ holds, asks for what it lacks, and answers who asks.
 
 from __future__ import annotations
 
+import hashlib
 import secrets
 import sys
 import threading
@@ -172,8 +173,15 @@ def standings(
         )
         words = [f"{behind} behind"] * bool(behind) + [f"{ahead} ahead"] * bool(ahead)
         detail = "the same transactions" if same else ", ".join(words) or "another branch"
-        out.append(Standing(name, digest if same else "", same, detail))
+        out.append(Standing(name, digest if same else _heads_digest(heads), same, detail))
     return out
+
+
+def _heads_digest(heads: dict[AuthorId, Head]) -> str:
+    """What a robot that holds other transactions is known by: digests of maps are not sent."""
+    words = [f"{a.hex()} {h.length} {h.tip.hex()} {h.cut}" for a, h in sorted(heads.items())]
+    found = hashlib.blake2b("\n".join(words).encode(), digest_size=16)
+    return f"heads {found.hexdigest()}"
 
 
 def _length(head: Head | None) -> int:
@@ -189,6 +197,12 @@ def _settings(endpoint: str, file: Path | None) -> Settings:
         settings = load_settings(file)
     config = settings.config
     network = config.network
+    if "/" not in endpoint.strip("/") or (network.tls and not endpoint.startswith("tls/")):
+        example = "tls/robot1.local:7447" if network.tls else "tcp/192.168.1.7:7447"
+        raise DagmapError(
+            f'--live {endpoint}: an endpoint such as "{example}" is wanted, one that a robot '
+            "listens on (`listen` of its [network])"
+        )
     mode = "peer" if network.mode == "router" else network.mode
     way = NetworkConfig(
         mode=mode,

@@ -34,7 +34,7 @@ def standing(title: str, standings: Sequence[Standing], digest: str, remark: str
         (
             _colored(_SIGNS[each.agrees], (_GREEN if each.agrees else _RED)),
             escape(each.robot),
-            _code(each.digest[:12]),
+            _code(each.digest[: 18 if each.digest.startswith("heads ") else 12]),
             escape(each.detail),
         )
         for each in standings
