@@ -16,13 +16,14 @@ import numpy as np
 
 from .kernels.voxels import SHIFT, nearest_facing, tally
 from .model import Floats, Int64s
-from .registration import Working, carry, inverse
+from .registration import SHARED, Working, carry, inverse
 from .surfels import FACING, FREE, Surfels, facing, kinds_of
 
 SAMPLE = 256  # surfels that shifts are tried with
 PEAKS = 24  # shifts along each of three axes
 PENALTY = 2  # of a surfel in free space, in the first look
 AGAINST = 8  # the same where everything is judged
+CONTRAST = 16  # the same where two poses are compared
 KEPT = 24  # alignments that are refined
 _ROTATIONS = 96
 _SAME_TURN = np.radians(4.0)
@@ -68,6 +69,12 @@ class Agreement:
     def score(self) -> float:
         """How far what agrees outweighs what contradicts."""
         return self.support - AGAINST * self.against
+
+    def rivalled(self, other: Agreement) -> float:
+        """What agrees with another pose, less what contradicts that one more often than this one,
+        where people, drift and noise may do so."""
+        usual = self.contrary * (other.support + other.against)
+        return other.support - CONTRAST * max(0.0, other.against - usual)
 
     def apart(self, one: Floats, other: Floats) -> float:
         """How far two poses (4, 4) carry the agreeing surfels apart at most, mm, about."""
@@ -161,7 +168,7 @@ def _shifts(
     """The best poses (4, 4) with this rotation, each with its tally."""
     points, normals = source.points @ turn.T, source.normals @ turn.T
     axes, offsets = _offsets(points, normals, target)
-    yield 4
+    yield 12
     if axes is None:
         return []
     grid = np.stack(np.meshgrid(*offsets, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -175,7 +182,7 @@ def _shifts(
     for at in range(0, len(moves), 4 * step):
         part = slice(at, at + 4 * step)
         tally(target.cells, target.shape, places, marks, moves[part], FREE, PENALTY, out[part])
-        yield 4
+        yield 12
     best = np.argsort(-out, kind="stable")[: 2 * KEPT]
     found = []
     for k in best[out[best] > 0].tolist():
@@ -329,7 +336,7 @@ def judge(source: Surfels, target: Surfels, pose: Floats) -> Working[Agreement]:
     firm = np.linalg.eigvalsh(jacobian.T @ jacobian)
     independent = _independent(source.groups[rows], target.groups[other])
     middle = source.points[rows].mean(axis=0)
-    yield 2
+    yield 15
     return Agreement(pose, support, counts, details, planes, firm, independent, middle, radius)
 
 
@@ -378,11 +385,12 @@ def _largest(bins: Int64s) -> int:
 
 def _independent(one: Int64s, other: Int64s) -> int:
     """Pairs of keyframes with agreeing surfels that have none in common; greedily."""
-    pairs, counts = np.unique(np.stack([one, other], axis=1), axis=0, return_counts=True)
+    width = int(other.max(initial=0)) + 1
+    pairs, counts = np.unique(one * width + other, return_counts=True)
     used: tuple[set[int], set[int]] = (set(), set())
     for k in np.argsort(-counts, kind="stable").tolist():
-        a, b = pairs[k].tolist()
-        if counts[k] >= 5 and a not in used[0] and b not in used[1]:
+        a, b = divmod(int(pairs[k]), width)
+        if counts[k] >= SHARED and a not in used[0] and b not in used[1]:
             used[0].add(a)
             used[1].add(b)
     return len(used[0])

@@ -17,7 +17,7 @@ from .model import Floats, Int32s, Int64s
 from .payload import Anchor
 from .transaction import Transaction
 
-MOST_POINTS = 100_000  # of one author that are kept; of more every second, fourth, ...
+MOST_POINTS = 60_000  # of one author that are kept; of more every second, fourth, ...
 
 
 @dataclass(slots=True, eq=False)

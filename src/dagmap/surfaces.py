@@ -67,7 +67,7 @@ class Shape(Relation):
             return self._withdraw()
         beside = 4 * self._config.tolerance_mm
         rivals = (other for other in others if best.apart(best.pose, other.pose) > beside)
-        if any(rival.score >= RIVAL * best.score for rival in rivals):
+        if any(best.rivalled(other) >= RIVAL * best.support for other in rivals):
             self.reason = "the maps fit in more than one way"
             return self._withdraw()
         return self._settle(best.pose, best, best.score)
@@ -123,7 +123,7 @@ class Surfaces:
                 if source in described and target in described:
                     continue
                 known = self.shapes.get((source, target))
-                placed = known is not None and known.published is not None
+                placed = known is not None and bool(known.published or known.answer)
                 if placed or not together(source, target, consensus.firm):
                     out.add((source, target))
         return out

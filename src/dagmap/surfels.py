@@ -32,7 +32,7 @@ _SHORT = 2  # cells before its end in which a ray proves nothing
 _ALIGNED = np.cos(np.radians(10.0))
 _APART = np.cos(np.radians(20.0))
 _MINOR = 0.03  # of the surfels: fewer make no axis
-_MODES = 256  # surfels from which axes are looked for
+_MODES, _SAMPLED = 128, 2500  # surfels that axes are looked for among
 _ORIGINS = slice(10, 13)  # columns of the moments
 _WIDE = 100_000  # smallest cells from the middle: what lies further away is left out
 _UNIT_POINTS, _UNIT_RAYS = 4000, 1000
@@ -124,11 +124,11 @@ def survey(points: Floats, origins: Floats, groups: Int64s, fine: float) -> Work
     points, origins, groups = points[near] - origin, origins[near] - origin, groups[near]
     while True:
         order, keys, ends = _sorted(points, cell)
-        yield 1 + len(points) // _UNIT_POINTS
+        yield 1 + len(points) // 1500
         size = _extent(points, cell)
         if len(ends) <= MOST and size <= CELLS:
             ranges = _neighbourhoods(keys, ends)
-            yield 1 + len(ends) // 1000
+            yield 1 + len(ends) // 300
             count = sum((high - low) for low, high in ranges)
             if np.median(count) >= FILLED or len(ends) < 64:
                 break
@@ -144,7 +144,7 @@ def survey(points: Floats, origins: Floats, groups: Int64s, fine: float) -> Work
     normals = normals * np.where((view * normals).sum(axis=1) < 0, -1.0, 1.0)[:, None]
     place, normals = place[flat], normals[flat]
     axes = axes_of(normals)
-    yield 4
+    yield 20
     if len(axes) == 0:
         return None
     low, shape = _box(place, cell)
@@ -238,7 +238,7 @@ def _planes(
         values, vectors = np.linalg.eigh(spread[at : at + _UNIT_POINTS])
         lengths[at : at + _UNIT_POINTS] = values
         normals[at : at + _UNIT_POINTS] = vectors[:, :, 0]
-        yield 16
+        yield 20
     lengths = np.sqrt(np.maximum(lengths, 0.0))
     flat = (count[:, 0] >= _FEW) & (lengths[:, 0] <= _FLAT * lengths[:, 1])
     return middle, normals, flat
@@ -246,7 +246,7 @@ def _planes(
 
 def axes_of(normals: Floats) -> Floats:
     """(A, 3) directions that many normals (S, 3) have or oppose, most first."""
-    left = normals[:: 1 + len(normals) // 4000]
+    left = normals[:: 1 + len(normals) // _SAMPLED]
     few = max(8.0, _MINOR * len(left))
     out: list[Floats] = []
     while len(out) < AXES and len(left) >= few:
