@@ -1,7 +1,7 @@
 """Robots that share no frame and have no descriptors: how often and how well LiDARs are placed.
 
-`python bench/placing_lidar.py`: each run draws a building (rooms of 4 to 25 m, all of one size, with
-boxes in them), a LiDAR and two robots that walk through it, each with a SLAM frame of its own: any
+`python bench/placing_lidar.py`: each run draws a building (rooms of 4 to 25 m, all of one size,
+with boxes in them), a LiDAR and two robots that walk through it, each with a SLAM frame of its own: any
 turn, up to 20 m away. Some pairs walk in one building, some in two buildings with rooms of the same
 size, and of some the second one's world is mirrored. A placement is false where it is mirrored, of
 two buildings, or off by more than 30 cm or 3 degrees: half of the robots drift as they walk, so

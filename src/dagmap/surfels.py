@@ -22,7 +22,7 @@ FACING = 1 << 10  # length of a normal in integers
 MOST = 20_000  # occupied cells; where there are more, cells are larger
 CELLS = 1 << 22  # of a grid
 FINE = 1.25  # tolerances: edge of the smallest cells
-FILLED = 10  # points in a cell and its neighbours, in the median: else cells are larger
+FILLED = 12  # points around a point, in the median: else cells are larger
 _LARGER = 1.25  # so much, each time
 _FEW = 6  # points of a surfel at least
 _FLAT = 0.35  # of its extent along the surface: how thick it is at most
@@ -130,7 +130,8 @@ def survey(points: Floats, origins: Floats, groups: Int64s, fine: float) -> Work
             ranges = _neighbourhoods(keys, ends)
             yield 1 + len(ends) // 300
             count = sum((high - low) for low, high in ranges)
-            if np.median(count) >= FILLED or len(ends) < 64:
+            each = np.diff(ends, prepend=0)
+            if np.median(np.repeat(count, each)) >= FILLED or len(ends) < 64:
                 break
         cell *= _LARGER
     sums = _moments(points[order], origins[order])
