@@ -1,11 +1,11 @@
 """Robots that share no frame and have no descriptors: how often and how well LiDARs are placed.
 
 `python bench/placing_lidar.py`: each run draws a building (rooms of 4 to 25 m, all of one size,
-with boxes in them), a LiDAR and two robots that walk through it, each with a SLAM frame of its own: any
-turn, up to 20 m away. Some pairs walk in one building, some in two buildings with rooms of the same
-size, and of some the second one's world is mirrored. A placement is false where it is mirrored, of
-two buildings, or off by more than 30 cm or 3 degrees: half of the robots drift as they walk, so
-that their maps are off by themselves.
+with boxes in them), a LiDAR and two robots that walk through it, each with a SLAM frame of its
+own: any turn, up to 20 m away. Some pairs walk in one building, some in two buildings with rooms of
+the same size, and of some the second one's world is mirrored. A placement is false where it is
+mirrored, of two buildings, or off by more than 30 cm or 3 degrees: half of the robots drift as they
+walk, so that their maps are off by themselves.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def drawn(rng: np.random.Generator) -> tuple[SceneConfig, SensorConfig, MotionCo
         kind="lidar",
         points=int(rng.choice([400, 800])),
         range=30.0,
-        field=(75.0, float(rng.choice([30.0, 60.0]))),
+        field=(75.0, float(rng.choice([30.0, 60.0, 90.0]))),
         noise=float(rng.choice([0.01, 0.03])),
         outliers=float(rng.choice([0.0, 0.02, 0.1, 0.2])),
         tracked=0.0,
@@ -95,7 +95,8 @@ def one_run(kind: str, seed: int, config: Config) -> dict[str, Any]:
     return {
         "kind": kind, "seed": seed, "overlap": round(overlap, 3) if kind == "overlap" else None,
         "scene": f"{building.rooms} of {building.room:g} m, {building.objects} boxes",
-        "sensor": f"{sensor.points} points, {sensor.noise * 100:g} cm, {sensor.outliers:g} wrong",
+        "sensor": f"{sensor.points} points, {sensor.field[1]:g} degrees, "
+        f"{sensor.noise * 100:g} cm, {sensor.outliers:g} wrong",
         "drift": motion.drift, "people": building.people, "seconds": seconds,
         "placed": errors is not None, "false": off or (errors is not None and kind != "overlap"),
         "metres": None if errors is None else round(errors[0], 4),

@@ -28,9 +28,9 @@ ENOUGH = 500  # points of a frame, before its shape is looked at
 GROWN = 1.25  # times as many points: worth another search; for what is placed
 SETTLED = 2.0
 NEWEST = 4  # sessions of an author that are looked at
-PLANES = 10  # that agree beside the largest one in each direction
-CONTRARY = 0.005  # share that may contradict for each of these planes (people, drift), and at most
-MOST_CONTRARY = 0.1
+PLANES = 8  # that agree beside the largest one in each direction
+CONTRARY = 0.004  # share that may contradict for each of these planes (people, drift), and at most
+MOST_CONTRARY = 0.08
 _DECODED = 300  # features a unit
 
 
@@ -48,7 +48,7 @@ class Shape(Relation):
         least = self._config.inliers
         if found.independent < 2:
             return "only one keyframe of a robot agrees"
-        if found.firm[0] < least:
+        if found.firm[0] < least / 2:
             return "the surfaces that agree do not fix the pose"
         if found.planes < PLANES or found.inliers < 2 * least:
             return "the surfaces that agree are too plain: another room could look so"
@@ -59,7 +59,7 @@ class Shape(Relation):
     def conclude(self, found: list[Agreement]) -> Link | None:
         """Publish the best of all ways (best first) if it is believed and the only one."""
         if not found:
-            self.reason = "nothing in common was seen yet"
+            self.reason = "no way was found to lay the surfaces on each other"
             return self._withdraw()
         best, *others = found
         self.reason = self.lacks(best) or ""

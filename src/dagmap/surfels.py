@@ -25,13 +25,14 @@ FINE = 1.25  # tolerances: edge of the smallest cells
 FILLED = 12  # points around a point, in the median: else cells are larger
 _LARGER = 1.25  # so much, each time
 _FEW = 6  # points of a surfel at least
+_SPARSE = 0.35  # of the usual number around a point: so many, too; stray points are fewer
 _FLAT = 0.35  # of its extent along the surface: how thick it is at most
 _RAYS = 30_000
 _PASSES = 2  # rays that prove a cell free
 _SHORT = 2  # cells before its end in which a ray proves nothing
 _ALIGNED = np.cos(np.radians(10.0))
 _APART = np.cos(np.radians(20.0))
-_MINOR = 0.03  # of the surfels: fewer make no axis
+_MINOR = 0.015  # of the surfels: fewer make no axis
 _MODES, _SAMPLED = 128, 2500  # surfels that axes are looked for among
 _ORIGINS = slice(10, 13)  # columns of the moments
 _WIDE = 100_000  # smallest cells from the middle: what lies further away is left out
@@ -130,13 +131,13 @@ def survey(points: Floats, origins: Floats, groups: Int64s, fine: float) -> Work
             ranges = _neighbourhoods(keys, ends)
             yield 1 + len(ends) // 300
             count = sum((high - low) for low, high in ranges)
-            each = np.diff(ends, prepend=0)
-            if np.median(np.repeat(count, each)) >= FILLED or len(ends) < 64:
+            usual = float(np.median(np.repeat(count, np.diff(ends, prepend=0))))
+            if usual >= FILLED or len(ends) < 64:
                 break
         cell *= _LARGER
     sums = _moments(points[order], origins[order])
     yield 1 + len(points) // 1000
-    middle, normals, flat = yield from _planes(sums, ranges)
+    middle, normals, flat = yield from _planes(sums, ranges, max(_FEW, _SPARSE * usual))
     first = np.concatenate([[0], ends[:-1]])
     own = sums[ends] - sums[first]
     place = own[:, 1:4] / own[:, :1]
@@ -223,7 +224,7 @@ def _moments(points: Floats, origins: Floats) -> Floats:
 
 
 def _planes(
-    sums: Floats, ranges: list[tuple[Int64s, Int64s]]
+    sums: Floats, ranges: list[tuple[Int64s, Int64s]], few: float
 ) -> Working[tuple[Floats, Floats, Bools]]:
     """Of the points around each cell: middle, normal, and whether they are flat."""
     total = np.zeros((len(ranges[0][0]), 10))
@@ -241,7 +242,7 @@ def _planes(
         normals[at : at + _UNIT_POINTS] = vectors[:, :, 0]
         yield 20
     lengths = np.sqrt(np.maximum(lengths, 0.0))
-    flat = (count[:, 0] >= _FEW) & (lengths[:, 0] <= _FLAT * lengths[:, 1])
+    flat = (count[:, 0] >= few) & (lengths[:, 0] <= _FLAT * lengths[:, 1])
     return middle, normals, flat
 
 
