@@ -29,9 +29,11 @@ _ROTATIONS = 96
 _SAME_TURN = np.radians(4.0)
 _ALONG = 0.95  # cosine: a surfel that faces along an axis
 ALIKE = round(0.8 * FACING**2)  # cosine of the normals of two surfels that are one surface
-_ROUNDS = 8
+_REACHES = (2.0, 1.5, 1.0, 0.75, 0.5, 0.5, 0.5, 0.5)  # cells from a plane, of what is brought there
+_REFINED, _FEWEST = 1200, 6  # surfels that are, at most and at least
+_TURNED, _DAMPING = 1e-4, 1e-5  # rad that count as a mm; of the points, as if at rest
 _STEEP = 0.35  # volume that three axes span at least
-_TALLIED = 400_000  # look-ups a unit
+_TALLIED = 1_600_000  # look-ups in one go, some twelve units
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,13 +130,7 @@ def _rotations(here: Floats, there: Floats) -> list[Floats]:
         for i, j in _pairs(here):
             for s, t in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
                 one, two = s * here[i], t * here[j]
-                if (
-                    abs(
-                        np.arccos(np.clip(one @ two, -1, 1))
-                        - np.arccos(np.clip(there[a] @ there[b], -1, 1))
-                    )
-                    > _SAME_TURN
-                ):
+                if abs(_between(one, two) - _between(there[a], there[b])) > _SAME_TURN:
                     continue
                 turn = aim @ _triad(one, two).T
                 if all(_angle(turn @ known.T) > _SAME_TURN for known in out):
@@ -142,6 +138,11 @@ def _rotations(here: Floats, there: Floats) -> list[Floats]:
                 if len(out) >= _ROTATIONS:
                     return out
     return out
+
+
+def _between(one: Floats, two: Floats) -> float:
+    """Angle of two directions, rad."""
+    return float(np.arccos(np.clip(one @ two, -1, 1)))
 
 
 def _pairs(axes: Floats) -> list[tuple[int, int]]:
@@ -179,8 +180,8 @@ def _shifts(
     moves = np.floor(np.clip(shifts / target.cell, -1e6, 1e6) * (1 << SHIFT)).astype(np.int32)
     out = np.zeros(len(moves), np.int64)
     step = max(1, _TALLIED // len(rows))
-    for at in range(0, len(moves), 4 * step):
-        part = slice(at, at + 4 * step)
+    for at in range(0, len(moves), step):
+        part = slice(at, at + step)
         tally(target.cells, target.shape, places, marks, moves[part], FREE, PENALTY, out[part])
         yield 12
     best = np.argsort(-out, kind="stable")[: 2 * KEPT]
@@ -277,33 +278,31 @@ def _matched(points: Floats, normals: Floats, target: Surfels, reach: int) -> tu
     return rows, out[rows]
 
 
-def refine(source: Surfels, target: Surfels, pose: Floats, count: int = 1200) -> Working[Floats]:
-    """Point to plane, from coarse to fine."""
-    step = 1 + len(source) // count
+def refine(source: Surfels, target: Surfels, pose: Floats) -> Working[Floats]:
+    """Bring surfels onto the planes of those near them, from coarse to fine."""
+    step = 1 + len(source) // _REFINED
     points, normals = source.points[::step], source.normals[::step]
-    for round_ in range(_ROUNDS):
-        moved = carry(pose, points)
-        rows, other = _matched(moved, normals @ pose[:3, :3].T, target, 2 if round_ < 2 else 1)
-        yield 10 if round_ < 2 else 4
-        if len(rows) < 6:
+    for reach in _REACHES:
+        moved, wide = carry(pose, points), reach > 1.0
+        rows, other = _matched(moved, normals @ pose[:3, :3].T, target, 2 if wide else 1)
+        yield 10 if wide else 4
+        place, normal = moved[rows], target.normals[other]
+        away = ((target.points[other] - place) * normal).sum(axis=1)
+        near = np.abs(away) < reach * target.cell
+        if near.sum() < _FEWEST:
             break
-        p, n = moved[rows], target.normals[other]
-        off = ((target.points[other] - p) * n).sum(axis=1)
-        reach = target.cell * (2.0, 1.5, 1.0, 0.75, 0.5)[min(round_, 4)]
-        near = np.abs(off) < reach
-        p, n, off = p[near], n[near], off[near]
-        if len(p) < 6:
-            break
-        centre = p.mean(axis=0)
-        jacobian = np.concatenate([np.cross(p - centre, n), n], axis=1)
-        scale = np.array([1e-4] * 3 + [1.0] * 3)
-        damped = (jacobian * scale).T @ (jacobian * scale) + 1e-3 * len(p) * np.eye(6) * 1e-2
-        change = scale * np.linalg.solve(damped, (jacobian * scale).T @ off)
-        small = _small(change, centre)
-        pose = small @ pose
-        if round_ > 4 and np.abs(change[3:]).max() < 0.5 and np.abs(change[:3]).max() < 1e-5:
-            break
+        pose = _step(place[near], normal[near], away[near]) @ pose
     return pose
+
+
+def _step(points: Floats, normals: Floats, away: Floats) -> Floats:
+    """(4, 4) the small motion that brings points (N, 3) nearest to planes that lie `away` (N,)
+    along normals (N, 3); what these do not fix hardly moves."""
+    centre = points.mean(axis=0)
+    scale = np.array([_TURNED] * 3 + [1.0] * 3)
+    jacobian = np.concatenate([np.cross(points - centre, normals), normals], axis=1) * scale
+    damped = jacobian.T @ jacobian + _DAMPING * len(points) * np.eye(6)
+    return _small(scale * np.linalg.solve(damped, jacobian.T @ away), centre)
 
 
 def _small(change: Floats, centre: Floats) -> Floats:
@@ -326,7 +325,7 @@ def judge(source: Surfels, target: Surfels, pose: Floats) -> Working[Agreement]:
     rows, other, against = mine
     support = float(source.rarity[rows].sum() + target.rarity[theirs[0]].sum())
     counts = float(source.rarity[against].sum() + target.rarity[theirs[2]].sum())
-    if len(rows) < 6:
+    if len(rows) < _FEWEST:
         return Agreement(pose, support, counts)
     details, planes = _details(source, rows)
     p, n = carry(pose, source.points[rows]), target.normals[other]
@@ -372,7 +371,7 @@ def _details(source: Surfels, rows: Int64s) -> tuple[int, int]:
         order = np.sort(counts)[::-1]
         rest = counts.sum() - _largest(bins[kinds == kind])
         details += int(rest)
-        planes += int((order >= 6).sum()) - 1
+        planes += int((order >= _FEWEST).sum()) - 1
     return details, max(0, planes)
 
 

@@ -72,7 +72,7 @@ class Placing:
     def why(self, consensus: Consensus) -> dict[FrameId, str]:
         """Of each frame outside of this robot's components: why it is not placed there."""
         reasons = dict.fromkeys(
-            sorted(self._strange(consensus, consensus.frames)), "no described points came yet"
+            sorted(self._strange(consensus, consensus.frames)), "too little came yet to compare"
         )
         for (_, target), relation in sorted(self._relations.items()):
             if target in reasons and relation.there and relation.reason:

@@ -128,15 +128,13 @@ def survey(points: Floats, origins: Floats, groups: Int64s, fine: float) -> Work
         yield 1 + len(points) // 1500
         size = _extent(points, cell)
         if len(ends) <= MOST and size <= CELLS:
-            ranges = _neighbourhoods(keys, ends)
-            yield 1 + len(ends) // 300
+            ranges = yield from _neighbourhoods(keys, ends)
             count = sum((high - low) for low, high in ranges)
             usual = float(np.median(np.repeat(count, np.diff(ends, prepend=0))))
             if usual >= FILLED or len(ends) < 64:
                 break
         cell *= _LARGER
-    sums = _moments(points[order], origins[order])
-    yield 1 + len(points) // 1000
+    sums = yield from _moments(points[order], origins[order])
     middle, normals, flat = yield from _planes(sums, ranges, max(_FEW, _SPARSE * usual))
     first = np.concatenate([[0], ends[:-1]])
     own = sums[ends] - sums[first]
@@ -202,7 +200,7 @@ def _box(points: Floats, cell: float) -> tuple[Floats, Int64s]:
     return low - 2 * cell, np.ceil((high - low) / cell).astype(np.int64) + 4
 
 
-def _neighbourhoods(keys: Int64s, ends: Int64s) -> list[tuple[Int64s, Int64s]]:
+def _neighbourhoods(keys: Int64s, ends: Int64s) -> Working[list[tuple[Int64s, Int64s]]]:
     """Of each cell the nine ranges of points in it and its neighbours."""
     own = keys[ends - 1]
     out = []
@@ -211,16 +209,20 @@ def _neighbourhoods(keys: Int64s, ends: Int64s) -> list[tuple[Int64s, Int64s]]:
             row = own + (x << 2 * _BITS) + (y << _BITS)
             low = np.searchsorted(keys, row - 1, "left")
             out.append((low, np.searchsorted(keys, row + 1, "right")))
+            yield 1 + len(ends) // 2500
     return out
 
 
-def _moments(points: Floats, origins: Floats) -> Floats:
+def _moments(points: Floats, origins: Floats) -> Working[Floats]:
     """(N + 1, 13) running sums: count, x y z, xx xy xz yy yz zz, origin."""
     x, y, z = points.T
     columns = [np.ones(len(points)), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z, *origins.T]
-    sums = np.zeros((len(points) + 1, len(columns)))
-    np.cumsum(np.stack(columns, axis=1), axis=0, out=sums[1:])
-    return sums
+    sums = np.zeros((len(columns), len(points) + 1))
+    yield 1 + len(points) // 10_000
+    for column, total in zip(columns, sums, strict=True):
+        np.cumsum(column, out=total[1:])
+        yield 1 + len(points) // 60_000
+    return np.ascontiguousarray(sums.T)
 
 
 def _planes(
