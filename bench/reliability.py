@@ -13,6 +13,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar
@@ -37,6 +38,7 @@ ROOT = Path(__file__).parents[1]
 LONG = ("hundred", "hour")  # scenarios that are runs of their own, not part of the sweep
 LOSSES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 KINDS = ("forger", "eraser", "splitter", "wrong-frame", "outsider", "early-outsider")
+SLICE = 25  # seeds of each scenario between two times that a sweep is kept
 FLEET = 8  # robots in the runs with loss and in those with liars
 A, B = TypeVar("A"), TypeVar("B")
 Tell = Callable[[str, float], None]  # (what is measured, share done)
@@ -148,18 +150,31 @@ def spread(
     return results
 
 
-def swept(seeds: int, jobs: int, tell: Callable[[float], None]) -> dict[str, Any]:
-    """Every scenario but the long ones, with about `seeds` seeds in all."""
+def swept(options: argparse.Namespace, tell: Callable[[float], None]) -> dict[str, Any]:
+    """Every scenario but the long ones, with about as many seeds in all as asked for.
+
+    It takes longest, so every slice of it is kept: an interrupted one goes on from there.
+    """
     paths = [path for path in sorted((ROOT / "scenarios").glob("*.toml")) if path.stem not in LONG]
-    each = -(-seeds // len(paths))
-    total = each * len(paths)
     scenarios = [load_scenario(path) for path in paths]
-    failure = sweep(scenarios, range(each), jobs, lambda done: tell(done / total))
+    each, failure = -(-options.seeds // len(paths)), None
+
+    def of(seeds: range) -> str | None:
+        before, total = seeds.start * len(paths), each * len(paths)
+        found = sweep(scenarios, seeds, options.jobs, lambda done: tell((before + done) / total))
+        return (
+            None if found is None else f"{found.scenario.name}, seed {found.seed}: {found.detail}"
+        )
+
+    for first in range(0, each, SLICE):
+        seeds = range(first, min(first + SLICE, each))
+        failure = failure or kept(options, f"sweep_{first}", partial(of, seeds))
+        tell(seeds.stop / each)
     return {
         "scenarios": [path.stem for path in paths],
         "seeds_each": each,
-        "runs": total,
-        "failure": None if failure is None else f"seed {failure.seed}: {failure.detail}",
+        "runs": each * len(paths),
+        "failure": failure,
     }
 
 
@@ -261,7 +276,7 @@ def measure(options: argparse.Namespace, tell: Tell) -> dict[str, Any]:
         "divergence": lambda: troubled(about("divergence")),
         "loss": lambda: lossy(LOSSES, runs, jobs, about("loss")),
         "liars": lambda: lying(max(1, runs // 10), jobs, about("liars")),
-        "sweep": lambda: swept(options.seeds, jobs, about("sweep")),
+        "sweep": lambda: swept(options, about("sweep")),
     }
     figures = {name: kept(options, name, part) for name, part in parts.items()}
     return figures | {"fuzz_executions": fuzzed()}

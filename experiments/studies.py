@@ -85,14 +85,14 @@ def parameters(config: Config) -> Row:
         "delta": fold.delta,
         "cell": fold.cell,
         "max_ray": fold.max_ray,
-        "doubt": fold.doubt,
+        "doubt": "learned" if fold.doubt is None else fold.doubt,
         "reference_pitch": graph.reference_pitch,
         "v_th": graph.v_th,
     }
 
 
-def with_delta(config: Config, delta: float, doubt: int) -> Config:
-    """With another delta, cells that go with it, and another doubt."""
+def with_delta(config: Config, delta: float, doubt: int | None = None) -> Config:
+    """With another delta, cells that go with it, and a doubt that is fixed."""
     cell = max(round(10 / 3 * delta, 2), 0.05)
     fold = FoldConfig(delta=delta, cell=cell, max_ray=config.fold.max_ray, doubt=doubt)
     return msgspec.structs.replace(config, fold=fold)

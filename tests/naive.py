@@ -435,7 +435,7 @@ def naive_misses(config: FoldConfig, fold: NaiveMap, rays: NaiveRays) -> list[in
     lonely = [n for n, s, a in zip(fold.nodes, support, against, strict=True) if s <= 1 and a > 0]
     discredited = sum((n.seen for n in lonely), Counter[int]())
     all_gone = naive_gone(config, fold, moments, passed, ended)
-    out = []
+    balances, records = [], []
     for k, node in enumerate(fold.nodes):
         record = min(naive_log2(200 * discredited[a] // observed[a] + 1) for a in node.seen)
         square = distance2(node.seed, node.origin)
@@ -443,10 +443,28 @@ def naive_misses(config: FoldConfig, fold: NaiveMap, rays: NaiveRays) -> list[in
         balance = 6 * naive_log2(support[k])
         balance += 6 * (naive_log2(length) - naive_log2(config.delta_mm))
         balance -= naive_log2(1 + passed[k]) + 2 * naive_log2(1 + hidden[k])
-        balance -= 2 * record + 16 * config.doubt
+        balances.append(balance - 2 * record)
+        records.append(record)
+    suspect = [a > b for a, b in zip(passed, ended, strict=True)]
+
+    def naive_doubt(mine: list[int]) -> int:
+        """Of 0 to 36 bits those below which suspects exceed a quarter by the most, or 36."""
+        gains = []
+        for bits in range(37):
+            below = [suspect[k] for k in mine if balances[k] <= 16 * bits and bits > 0]
+            gains.append(4 * sum(below) - len(below) + 16 * (bits == 36))
+        return gains.index(max(gains))
+
+    learned = {
+        author: naive_doubt([k for k in range(len(balances)) if author in fold.nodes[k].seen])
+        for author in observed
+    }
+    out = []
+    for k, node in enumerate(fold.nodes):
+        doubt = min(learned[a] for a in node.seen) if config.doubt is None else config.doubt
         gone = all_gone[k] and config.miss_say > 0
-        counted = 1 if against[k] == 0 and (record > 0 or gone) else against[k]
-        out.append(counted if balance <= 0 or gone else 0)
+        counted = 1 if against[k] == 0 and (records[k] > 0 or gone) else against[k]
+        out.append(counted if balances[k] <= 16 * doubt or gone else 0)
     return out
 
 

@@ -15,7 +15,7 @@ import pytest
 from rosbags.rosbag1 import Writer
 
 from bags import Make, Message, pictures, pose_at, write_bag
-from dagmap.io.sources import Options, describe_source, open_source
+from dagmap.io.sources import Options, _bagged, describe_source, open_source
 from dagmap.io.sources._poses import FrameTree, between, inverse
 from dagmap.model import RecordingError
 from test_replay import dagmap
@@ -367,6 +367,55 @@ def test_what_is_no_bag_is_named(tmp_path: Path) -> None:
     (tmp_path / "old.bag").write_bytes(b"#ROSBAG V1.2\n" + bytes(100))
     with pytest.raises(RecordingError, match="old.bag: .*version 102 is not supported"):
         open_source(tmp_path / "old.bag")
+
+
+def test_a_folder_whose_index_is_missing(tmp_path: Path) -> None:
+    make = Make()
+    folder = write_bag(tmp_path / "walk", make, lidar(make))
+    (folder / "metadata.yaml").unlink()
+    with pytest.raises(RecordingError, match="walk: .*walk.mcap .*no metadata.yaml.*reindex"):
+        open_source(folder)
+    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: {version: 9, rel")
+    with pytest.raises(RecordingError, match="walk: damaged, cut short"):
+        open_source(folder)
+    assert len(list(open_source(folder, Options(keep_going=True)))) == 5
+
+
+def test_a_bag_of_several_files(tmp_path: Path) -> None:
+    """As `--max-bag-size` splits it, more than nine of them; one that is damaged costs itself."""
+    make, folder = Make(), tmp_path / "walk"
+    folder.mkdir()
+    messages, names = lidar(make), []
+    for i in range(11):
+        part = write_bag(tmp_path / f"part_{i}", make, messages[2 * i : 2 * i + 2] or messages[-1:])
+        names.append(f"walk_{i}.mcap")
+        next(part.glob("*.mcap")).rename(folder / names[-1])
+    said = (tmp_path / "part_0" / "metadata.yaml").read_text()
+    whole = write_bag(tmp_path / "whole", make, messages) / "metadata.yaml"
+    said = whole.read_text().replace("- whole.mcap", "\n  ".join(f"- {name}" for name in names), 1)
+    (folder / "metadata.yaml").write_text(said)
+    source = open_source(folder)
+    assert len(list(source)) == len(source) == 5
+    (folder / "walk_1.mcap").write_bytes(b"damaged")
+    with pytest.raises(RecordingError, match="walk: .*--keep-going"):
+        open_source(folder)
+    assert len(list(open_source(folder, Options(keep_going=True)))) == 4
+
+
+def test_pictures_far_from_their_partners_fill_no_memory(tmp_path: Path) -> None:
+    make = Make()
+    messages = rgbd(make)
+    depths = [m for m in messages if m[0] == "/camera/depth/image_raw"]
+    late = [(*m[:2], m[2] + 100, m[3]) for m in depths]
+    others = [m for m in messages if m not in depths]
+    path = write_bag(tmp_path / "walk.mcap", make, in_order([*others, *late]))
+    assert len(list(open_source(path))) == 3
+    for name, most in (("_STORED", 2), ("_STORED_BYTES", 150_000)):
+        with (
+            patch.object(_bagged, name, most),
+            pytest.raises(RecordingError, match="3 pictures of .* bytes wait .*ros2 bag convert"),
+        ):
+            list(open_source(path))
 
 
 def test_without_rosbags_the_extra_is_named(tmp_path: Path) -> None:

@@ -53,6 +53,29 @@ def test_a_model_becomes_a_map(model: Path, tmp_path: Path) -> None:
     assert json.loads(run.stdout)["map"]["nodes"] > 10
 
 
+def test_half_of_a_model_is_named(model: Path) -> None:
+    """And is not taken for the clouds of a LiDAR."""
+    suffix = "." + model.name
+    for lacking, there in (("images", "points3D"), ("points3D", "images")):
+        (model / f"{lacking}{suffix}").rename(model / "other")
+        with pytest.raises(RecordingError, match=f"no {lacking}{suffix} beside {there}{suffix}"):
+            open_source(model)
+        (model / "other").rename(model / f"{lacking}{suffix}")
+
+
+def test_a_text_that_ends_early_is_noticed(tmp_path: Path) -> None:
+    """At the end of a line too: COLMAP says how many there are."""
+    model = Path(shutil.copytree(DATA / "txt", tmp_path / "txt"))
+    for name, count in (("images", 2), ("points3D", 3)):
+        file = model / f"{name}.txt"
+        whole = file.read_text()
+        file.write_text("".join(whole.splitlines(keepends=True)[:-count]))
+        with pytest.raises(RecordingError, match=rf"{name}.txt: .* are promised, .* are there"):
+            open_source(model)
+        assert len(list(open_source(model, Options(keep_going=True)))) >= 2
+        file.write_text(whole)
+
+
 def test_models_that_were_cut_short(tmp_path: Path) -> None:
     for part in ("images.bin", "points3D.bin"):
         path = tmp_path / part / "bin"

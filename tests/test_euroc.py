@@ -241,6 +241,20 @@ def test_damaged_pictures_are_left_out_where_that_is_asked_for(walk: Path) -> No
     assert pictures[1].name in told[0] and "10 x 10 pixels, but sensor.yaml" in told[1]
 
 
+def test_what_is_whole_of_the_lists_is_kept(walk: Path) -> None:
+    for name in ("cam0", TRUTH):
+        file = walk / "mav0" / name / "data.csv"
+        lines = file.read_text().splitlines()
+        lines[3] = lines[3][:12] + "\0" * 100_000
+        file.write_text("\n".join(lines))
+    with pytest.raises(RecordingError, match="data.csv, line 4: .*--keep-going") as caught:
+        open_source(walk)
+    assert len(str(caught.value)) < 1000
+    source = open_source(walk, Options(keep_going=True))
+    assert len(source) >= COUNT - 2
+    assert source.skips.count == 2  # type: ignore[attr-defined]
+
+
 def test_a_scene_without_texture_gives_empty_cycles(walk: Path) -> None:
     for camera in CAMERAS:
         for picture in (walk / "mav0" / camera / "data").iterdir():

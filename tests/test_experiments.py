@@ -116,25 +116,26 @@ def test_agreement_comes_whatever_the_network(tmp_path: Path) -> None:
     assert quiet["agreement_s"] < trouble["agreement_s"]
 
 
-def test_sensors_are_better_off_tuned(tmp_path: Path) -> None:
+def test_what_is_learned_suits_sparse_sensors(tmp_path: Path) -> None:
     kinds = ("mono", sensors.MIXED)
-    result = checked(tmp_path, sensors.run(tmp_path, 15.0, kinds, (0.05,), (36, 20)))
+    result = checked(tmp_path, sensors.run(tmp_path, 15.0, kinds, (0.05,)))
     assert [row["robots"] for row in result["cases"]] == [3, 4]
     for row in result["cases"]:
-        assert all(each["agree"] for each in (row["defaults"], row["tuned"], *row["grid"]))
-        assert row["tuned"]["f_10_cm"] > row["defaults"]["f_10_cm"]
-        assert row["tuned"]["true_rejected"] < row["defaults"]["true_rejected"]
+        ways = ("defaults", "dense", "tuned")
+        assert all(each["agree"] for each in (*(row[way] for way in ways), *row["grid"]))
+        assert row["defaults"]["f_10_cm"] > row["dense"]["f_10_cm"] + 0.05
+        assert row["defaults"]["true_rejected"] < 0.1 < row["dense"]["true_rejected"]
         assert row["best_of_grid"]["f_10_cm"] == max(each["f_10_cm"] for each in row["grid"])
-        assert [(each["doubt"], each["delta"]) for each in row["grid"]] == [(36, 0.05), (20, 0.05)]
+        assert [each["doubt"] for each in row["grid"]] == ["learned", 36]
     assert "f_5_cm" in result["cases"][0]["tuned"]
 
 
-def test_where_features_are_few_the_defaults_suffer(tmp_path: Path) -> None:
+def test_where_features_are_few_the_defaults_hold(tmp_path: Path) -> None:
     result = checked(tmp_path, feature_poor.run(tmp_path, 15.0, (100, 15, 1)))
     rich, poor, barren = result["cases"]
     assert [row["points_a_cycle"] for row in result["cases"]] == [100, 15, 1]
-    assert poor["defaults"]["f_10_cm"] < rich["defaults"]["f_10_cm"] < rich["tuned"]["f_10_cm"]
-    assert poor["tuned"]["f_10_cm"] > 0.8
+    assert rich["defaults"]["f_10_cm"] > 0.9 and rich["tuned"]["f_10_cm"] > 0.9
+    assert poor["defaults"]["f_10_cm"] > 0.6 and poor["tuned"]["f_10_cm"] > 0.6
     assert poor["V_th = 3"]["issued"] < rich["V_th = 3"]["issued"] < rich["defaults"]["issued"]
     assert "tuned" not in barren and "no cycle has two points" in barren["refused"]
     assert "tune refuses" in result["measured"][2]

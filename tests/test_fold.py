@@ -712,7 +712,7 @@ def test_verdict_equals_its_twin(blocks: list[Block], seed: int) -> None:
         witnesses=int(rng.integers(1, 4)),
         hit_say=int(rng.integers(1, 4)),
         miss_say=int(rng.integers(0, 4)),
-        doubt=int(rng.choice([0, 10, 20, 36, 1000])),
+        doubt=rng.choice([None, 0, 10, 20, 36, 1000]),
         max_ray=0.4,
     )
     rays = RayEvidence(config.cell_mm, config.max_ray_mm, SALT)

@@ -83,7 +83,7 @@ def test_what_only_liars_say_is_confirmed_from_witnesses_liars_on(
         assert beyond is not None and beyond.liars_confirmed > 0, "one liar more and the bound ends"
 
 
-def doubting(scenario: Scenario, doubt: int) -> Scenario:
+def doubting(scenario: Scenario, doubt: int | None) -> Scenario:
     """With another weight of what lies around a place; 1000: nothing but votes counts."""
     fold = msgspec.structs.replace(scenario.config.fold, doubt=doubt)
     config = msgspec.structs.replace(scenario.config, fold=fold)
@@ -92,8 +92,8 @@ def doubting(scenario: Scenario, doubt: int) -> Scenario:
 
 @pytest.mark.parametrize("kind", SAYING)
 @pytest.mark.parametrize("liars", [1, 2])
-@pytest.mark.parametrize("doubt", [36, 1000])
-def test_what_outweighs_the_liars_is_never_lost(kind: str, liars: int, doubt: int) -> None:
+@pytest.mark.parametrize("doubt", [None, 36, 1000])
+def test_what_outweighs_the_liars_is_never_lost(kind: str, liars: int, doubt: int | None) -> None:
     """Places that honest robots saw first, with and without what lies around them."""
     lies = played(doubting(room(kind, liars, honest=4), doubt))[1].lies
     assert lies is not None and lies.proven_nodes > 30 and lies.proven_lost == 0

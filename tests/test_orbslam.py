@@ -134,6 +134,26 @@ def test_bad_texts_are_named(map_: Path, file: str, text: str, said: str) -> Non
         list(open_source(map_))
 
 
+def test_key_frames_that_are_damaged_are_left_out(map_: Path) -> None:
+    file = map_ / "KeyFrameTrajectory.txt"
+    file.write_text(file.read_text()[:-30])
+    with pytest.raises(RecordingError, match="line 4: 8 finite numbers are wanted.*--keep-going"):
+        open_source(map_)
+    assert len(open_source(map_, Options(keep_going=True))) == COUNT - 1
+
+
+def test_half_of_a_map_is_named(map_: Path) -> None:
+    (map_ / "KeyFrameTrajectory.txt").rename(map_ / "other")
+    with pytest.raises(
+        RecordingError, match="office: .*no KeyFrameTrajectory.txt beside MapPoints"
+    ):
+        open_source(map_)
+    (map_ / "MapPoints.txt").unlink()
+    (map_ / "other").rename(map_ / "KeyFrameTrajectory.txt")
+    with pytest.raises(RecordingError, match="office: .*no MapPoints.txt beside KeyFrameTraj"):
+        open_source(map_)
+
+
 def test_lines_that_are_no_points_are_left_out_where_that_is_asked_for(map_: Path) -> None:
     with (map_ / "MapPoints.txt").open("a") as file:
         file.write("1 2\n0 0 2\n")

@@ -154,7 +154,7 @@ def test_lzf_that_lies() -> None:
         ("poses.txt", tum([50.0]), "none of 5 clouds has a pose"),
         ("poses.txt", "1 0 0 0 0 0 0 9\n", "line 1: the quaternion is not of length 1"),
         ("times.txt", "1\n2\n", "2 stamps for 5 clouds"),
-        ("times.txt", "1\n2\n2\n3\n4\n", "stamp 3, 2.0, does not come after 2.0"),
+        ("times.txt", "1\n2\n2\n3\n4\n", "stamp 3: the stamp 2.0 does not come after 2.0"),
         ("calib.txt", "P0: 1\n", "no line `Tr:`"),
         ("calib.txt", "Tr: 1\n", "calib.txt, line 1: 12 finite numbers"),
     ],
@@ -163,6 +163,42 @@ def test_bad_texts_are_named(drive: Path, file: str, text: str, said: str) -> No
     (drive / file).write_text(text)
     with pytest.raises(RecordingError, match=said):
         open_source(drive)
+
+
+def test_what_is_whole_of_the_texts_is_kept(drive: Path, sequence: Path) -> None:
+    """Lines that count by their number: up to the first that is damaged; a cloud that is missing
+    takes none of the others' lines."""
+
+    def stamps(path: Path) -> list[float]:
+        source = open_source(path, Options(keep_going=True))
+        found = list(source)
+        assert len(source) == len(found) and source.skips.count  # type: ignore[attr-defined]
+        assert all(np.allclose(c.pose, pose_at(c.stamp), atol=1e-6) for c in found)
+        return [round(cycle.stamp, 3) for cycle in found]
+
+    poses, times = (drive / "poses.txt").read_text(), (drive / "times.txt").read_text()
+    (drive / "poses.txt").write_text(poses[:-150])
+    assert stamps(drive) == pytest.approx(STAMPS[:4])
+    (drive / "poses.txt").write_text(poses)
+    (drive / "times.txt").write_text(times.replace("1.400000e+00", "soon"))
+    assert stamps(drive) == pytest.approx(STAMPS[:2])
+    (drive / "times.txt").write_text(times)
+    (drive / "velodyne" / "000001.bin").unlink()
+    assert stamps(drive) == pytest.approx([STAMPS[0], *STAMPS[2:]])
+    lines = (sequence / "poses.txt").read_text().splitlines()
+    lines[3] = lines[3][:20] + "x" * 100_000
+    (sequence / "poses.txt").write_text("\n".join(lines))
+    assert stamps(sequence) == pytest.approx(STAMPS)
+    with pytest.raises(RecordingError, match="8 finite numbers are wanted") as caught:
+        open_source(sequence)
+    assert len(str(caught.value)) < 1000
+
+
+def test_kitti_s_poses_need_its_calibration(drive: Path) -> None:
+    (drive / "calib.txt").unlink()
+    with pytest.raises(RecordingError, match="calib.txt: missing; .* --same-frame"):
+        open_source(drive)
+    assert len(list(open_source(drive, Options(same_frame=True)))) == 5
 
 
 def test_clouds_without_stamps_go_with_numbered_poses_only(drive: Path) -> None:
@@ -244,3 +280,16 @@ def test_a_drive_becomes_a_map(drive: Path, tmp_path: Path) -> None:
     assert "5 cycles" in run.stdout
     run = dagmap("replay", drive, "--out", tmp_path / "out", "--max-features", 200)
     assert run.returncode == 0, run.stderr
+
+
+def test_no_error_goes_on_for_pages(sequence: Path) -> None:
+    cloud = sorted(sequence.glob("1.*"))[0]
+    text = b"# .PCD v0.7\nFIELDS " + b"9" * 100_000 + b" y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+    cloud.with_suffix(".pcd").write_bytes(
+        text + b"WIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA ascii\n1 2 3\n"
+    )
+    for other in sequence.glob("*.ply"):
+        other.unlink()
+    with pytest.raises(RecordingError, match="pcd: .*; copy or write it anew") as caught:
+        list(open_source(sequence))
+    assert len(str(caught.value)) < 2000

@@ -576,6 +576,20 @@ def test_wrong_stream(tmp_path: Path, changes: dict[str, Any], message: str) -> 
     assert str(path) in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "what", ["nan", "nan stamp", "nan pose", "rigid", "back", "equal", "moved rigid"]
+)
+def test_the_other_cycles_of_a_stream_are_kept(tmp_path: Path, what: str) -> None:
+    path = tmp_path / "wrong.npz"
+    np.savez(path, **plain(**WRONG[what][0]))
+    with pytest.raises(RecordingError, match="--keep-going leaves it out"):
+        list(open_source(path))
+    source = open_source(path, Options(keep_going=True))
+    for _ in range(2):
+        assert [cycle.stamp for cycle in source] == [1.0 if what not in ("back",) else 2.0]
+    assert source.skips.count == 1  # type: ignore[attr-defined]
+
+
 @pytest.mark.parametrize("packed", [True, False])
 def test_every_truncation_of_a_stream(tmp_path: Path, packed: bool) -> None:
     file = io.BytesIO()

@@ -61,6 +61,9 @@ def seeds() -> Iterable[bytes]:
     yield pack([(b"images.txt", b"1 1 0 0 0 0 0 1 1 a\nx x x\n"), (b"points3D.txt", points)])
     yield pack([(b"images.txt", b"1 1 0 0 0 0 0 1 1 a"), (b"points3D.txt", b"1 2\n")])
     yield pack([(b"images.txt", b"")])
+    yield pack([(b"images.bin", _images(seen))])
+    more = pictures.replace(b"# images", b"# Number of images: 3, mean")
+    yield pack([(b"images.txt", more), (b"points3D.txt", points)])
 
 
 TARGET = Target(run, mutate, seeds, {"dagmap.io.sources.colmap": ()}, max_len=8192)

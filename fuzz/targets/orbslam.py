@@ -44,6 +44,10 @@ def seeds() -> Iterable[bytes]:
     rgb = b"".join(b"property uchar %s\n" % name for name in (b"red", b"green", b"blue"))
     yield pack([poses, (b"PointCloud.ply", ply + rgb + b"end_header\n0 0 2 4 5 6\n")])
     yield pack([poses])
+    yield pack([(b"MapPoints.txt", points)])
+    yield pack([(b"other.txt", points)])
+    damaged = b"x 0 0 0 0 0 0 1\n1403636579763555584.0 0 0 0 0 0 0 1\n"
+    yield pack([(b"kf_a.txt", damaged), (b"MapPoints.txt", points)])
     body, seen = (b"body", b""), (b"MapPoints.txt", points)
     mounted = b"T_BS:\n  data: [1, 0, 0, 0.1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n"
     mounted += b"resolution: [48, 32]\nintrinsics: [60, 60, 24, 16]\n"

@@ -43,6 +43,9 @@ _CHANGES = (
     b"CREATE TABLE meta (a); CREATE TABLE transactions (a)",
     b"ALTER TABLE Node RENAME COLUMN pose TO other",
     b"INSERT INTO Node SELECT * FROM Node",
+    b"UPDATE Node SET stamp = CAST(x'ff' AS TEXT) WHERE id = 2",
+    b"ALTER TABLE Node RENAME TO Other; CREATE VIEW Node AS SELECT * FROM Other",
+    b"ALTER TABLE Feature ADD COLUMN more AS (zeroblob(1000000000))",
 )
 _VALUES = (
     b"NULL",

@@ -74,6 +74,12 @@ def seeds() -> Iterable[bytes]:
     yield pack([*bins, (b"poses.txt", 2 * row), calibration, (b"times.txt", b"0\n0.1\n")])
     yield pack([*bins, (b"poses.txt", row), (b"calib.txt", b"P0: 1\n")])
     yield pack([*bins, (b"poses.txt", row)])
+    lidar = (b"same", b"")
+    yield pack([*bins, (b"poses.txt", 2 * row), lidar])
+    yield pack([*bins, (b"poses.txt", row + b"1 x\n" + row), lidar, (b"times.txt", b"0\n1\n2\n")])
+    named = [(b"a.bin", kitti), (b"b.bin", kitti)]
+    yield pack([*named, (b"poses.txt", row)])
+    yield pack([*named, (b"poses.txt", 3 * row)])
     yield pack([*bins, (b"poses.txt", b"#\n"), (b"times.txt", b"0\n0\n")])
     yield pack([*bins, (b"poses.txt", b"#\n")])
     yield pack([*bins, (b"poses.txt", 2 * row), (b"times.txt", b"0\n")])

@@ -27,7 +27,7 @@ from .model import TransactionId
 
 # Of what is pickled: any change to the classes of the ledger or the fold counts it up. Between
 # releases the fold itself may change: what another release has folded is never taken over.
-VERSION = 9
+VERSION = 10
 
 
 class _Head(msgspec.Struct, frozen=True):

@@ -119,7 +119,9 @@ class FoldConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True
     witnesses: int = 2  # authors that a confirmed node needs
     hit_say: int = 1  # what one author's hits count for in one node, at most
     miss_say: int = 1  # what one author's misses count for in one node, at most
-    doubt: int = 36  # what speaks for a node must outweigh it, or misses count; see `weighing`
+    # Bits that what speaks for a node must outweigh, or misses count; None: each robot's are
+    # learned from how its own nodes fare, see `weighing.doubts`.
+    doubt: int | None = None
     cell: float = 0.10  # m: cell of the ray evidence
     max_ray: float = 5.0  # m: a ray is walked so far from its sensor
 
@@ -128,7 +130,8 @@ class FoldConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True
         self._require_range("witnesses", 1, 1000)
         self._require_range("hit_say", 1, 1000)
         self._require_range("miss_say", 0, 1000)
-        self._require_range("doubt", 0, 1000)
+        if self.doubt is not None:
+            self._require_range("doubt", 0, 1000)
         self._require_range("cell", 0.005, 10.0)
         self._require_range("max_ray", 0.0, 100.0)
         self._require(

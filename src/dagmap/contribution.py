@@ -89,6 +89,7 @@ class Contribution:
         "parents",
         "parts",
         "sightings",
+        "size",
         "starts",
         "transaction",
         "xyz",
@@ -98,6 +99,8 @@ class Contribution:
         bundle, paper = tx.payload.bundle, config.fold.preset == "paper"
         self.transaction, self.author = tx, author
         self.sightings = tx.payload.sightings
+        # observations: features and sightings
+        self.size = tx.features + sum(len(sighting.numbers) for sighting in self.sightings)
         self.parts: list[Part] = []
         self.fresh = True  # xyz still holds positions in the sensors' frames
         self.parents: Int64s | None = None
@@ -117,11 +120,6 @@ class Contribution:
     @property
     def key(self) -> Key:
         return self.transaction.key
-
-    @property
-    def size(self) -> int:
-        """Observations: features and sightings."""
-        return len(self.xyz) + sum(len(sighting.numbers) for sighting in self.sightings)
 
     @property
     def touched_cycles(self) -> set[int]:

@@ -108,7 +108,11 @@ class DefaultFold:
         newest = entries[self._nodes.first[:n]].astype(np.int64)
         moment = newest[:, matching.AUTHOR] << 32 | newest[:, matching.CYCLE]
         gone = weighing.gone(found, place, moment) & (config.miss_say > 0)
-        misses = weighing.misses(found, record, gone, config.delta_mm, config.doubt)
+        balance = weighing.balances(found, record, config.delta_mm)
+        doubt = np.full(n, weighing.SIXTEENTHS * (config.doubt or 0))
+        if config.doubt is None:
+            doubt = weighing.doubts(found, balance, self._nodes.first[:n], entries, self._authors)
+        misses = weighing.misses(found, record, balance <= doubt, gone)
         return verdict_of(found.hits, misses, found.witnesses, config.witnesses)
 
     def weigh(self, rays: RayEvidence) -> weighing.Evidence:

@@ -42,7 +42,11 @@ class CycleError(DagmapError, ValueError):
 
 
 class RecordingError(DagmapError):
-    """A recording cannot be read."""
+    """A recording cannot be read. What its files say is quoted, but not for pages."""
+
+    def __str__(self) -> str:
+        said = super().__str__()
+        return said if len(said) <= 2000 else f"{said[:1000]} ... {said[-900:]}"
 
 
 class OutputError(DagmapError):

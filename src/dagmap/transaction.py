@@ -67,7 +67,8 @@ class Transaction:
 
     def drop_columns(self) -> None:
         """Forget the decoded features; the bytes still hold them."""
-        self.payload = replace(self.payload, bundle=None)
+        if self.payload.bundle is not None:
+            self.payload = replace(self.payload, bundle=None)
 
     def decode_again(self, config: Config) -> Payload:
         """The whole payload anew from the bytes."""

@@ -6,6 +6,7 @@ were found, and what was tried beside them: docs/quality.md.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,8 @@ from .kernels.matching import AUTHOR, MOMENTS, NEXT, SEEN
 from .model import Bools, Int32s, Int64s
 
 SIXTEENTHS = 16
+MOST_DOUBT = 36  # bits; what was found with the truth at hand, for a sensor that sees densely
+_PRIOR = 16  # nodes that must speak against that
 # 256 * 2^(k / 16), rounded up, k from 1 to 15: where the fraction of a logarithm steps.
 _STEPS = np.array(
     [268, 280, 292, 305, 318, 332, 347, 363, 379, 395, 413, 431, 450, 470, 491], np.int64
@@ -67,13 +70,46 @@ def records(found: Evidence, first: Int32s, entries: Int32s, authors: int) -> In
     np.add.at(observed, entries[:, AUTHOR], entries[:, SEEN])
     np.add.at(discredited, entries[first[lonely(found)], AUTHOR], 1)
     record = log2_16(_PER_SHARE * discredited // np.maximum(observed, 1) + 1)
+    return _least(record, first, entries)
+
+
+def doubts(
+    found: Evidence, balance: Int64s, first: Int32s, entries: Int32s, authors: int
+) -> Int64s:
+    """(N,) what the balance of each node must exceed, sixteenths of bits: it is learned.
+
+    How much lies around a real node depends on how densely its sensor sees. Where most of what is
+    in the balance so low is real, hardly any ray passes through it. So an author is doubted up to
+    the bits below which its nodes that were passed more often than ended in exceed a quarter by the
+    most; up to `MOST_DOUBT` unless `_PRIOR` nodes and more say otherwise. Of a node's
+    witnesses the one doubted least counts.
+    """
+    rung = ((balance - 1) // SIXTEENTHS).clip(0, MOST_DOUBT)
+    says = np.where(found.passed > found.ended, 3, -1)
+    sums = np.zeros((authors, MOST_DOUBT + 2), np.int64)  # from the second column on, by rungs
+    for rows, author in _witnesses(first, entries):
+        np.add.at(sums, (author, rung[rows] + 1), says[rows])
+    gain = np.cumsum(sums[:, :-1], axis=1)
+    gain[:, MOST_DOUBT] += _PRIOR
+    best = np.argmax(gain, axis=1)
+    return _least(SIXTEENTHS * best, first, entries)
+
+
+def _least(of_author: Int64s, first: Int32s, entries: Int32s) -> Int64s:
+    """(N,) the least of a value (A,) of authors among each node's witnesses."""
     best = np.full(len(first), np.iinfo(np.int64).max)
+    for rows, author in _witnesses(first, entries):
+        best[rows] = np.minimum(best[rows], of_author[author])
+    return best
+
+
+def _witnesses(first: Int32s, entries: Int32s) -> Iterator[tuple[npt.NDArray[np.intp], Int32s]]:
+    """Nodes and an author of each: first the newest witnesses, then those before them."""
     rows, at = np.arange(len(first)), first
     while len(rows):
-        best[rows] = np.minimum(best[rows], record[entries[at, AUTHOR]])
+        yield rows, entries[at, AUTHOR]
         at = entries[at, NEXT]
         rows, at = rows[at >= 0], at[at >= 0]
-    return best
 
 
 def blocks(seed: Int32s, edge: int) -> Int64s:
@@ -144,17 +180,24 @@ def _about(cubes: Int64s, values: npt.NDArray[np.generic], groups: Int64s | None
     return out
 
 
-def misses(found: Evidence, record: Int64s, gone: Bools, delta_mm: int, doubt: int) -> Int32s:
-    """(N,) what counts against each node. record: (N,) that of its most reliable witness.
+def balances(found: Evidence, record: Int64s, delta_mm: int) -> Int64s:
+    """(N,) what speaks for each node, sixteenths of bits. record: that of its most reliable
+    witness.
 
     A node is dense around itself where it is real, the denser the nearer its sensor was; it is not
-    where rays pass, and nothing lies before it. Only where the balance of that is against a
-    node, or it is `gone`, do the authors who speak against it count; where nobody does, its
-    witness's record does, or that it is gone.
+    where rays pass, and nothing lies before it.
     """
     spread = log2_16(np.maximum(found.distance, 1)) - log2_16(np.array(delta_mm))
     balance = _SUPPORT * log2_16(np.maximum(found.support, 1)) + _DISTANCE * spread
     balance -= _PASSED * log2_16(1 + found.passed) + _HIDDEN * log2_16(1 + found.hidden)
-    balance -= _RECORD * record + SIXTEENTHS * doubt
+    return balance - _RECORD * record
+
+
+def misses(found: Evidence, record: Int64s, doubted: Bools, gone: Bools) -> Int32s:
+    """(N,) what counts against each node.
+
+    Only where it is doubted, or `gone`, do the authors who speak against it count; where nobody
+    does, its witness's record does, or that it is gone.
+    """
     counted = np.where((found.against == 0) & ((record > 0) | gone), 1, found.against)
-    return np.asarray(np.where((balance <= 0) | gone, counted, 0), np.int32)
+    return np.asarray(np.where(doubted | gone, counted, 0), np.int32)

@@ -1,7 +1,7 @@
 """From resolution and noise to parameters, each with its reason.
 
 What agrees with the plane of its neighbours in other cycles is taken for real, what lies far off it
-for wrong: so thresholds can be tried without truth, on graph and fold themselves.
+for wrong: so thresholds can be tried without truth, on the graph itself.
 """
 
 from __future__ import annotations
@@ -15,12 +15,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ..config import Config, FoldConfig, GraphConfig
-from ..evidence import RayEvidence
-from ..fold import Block, DefaultFold
+from ..config import Config, GraphConfig
 from ..graph import AdjacencyDag
 from ..kernels.codec import morton_order
-from ..model import LIMIT_MM, Bools, Floats, Int32s, Int64s, State
+from ..model import LIMIT_MM, Bools, Floats, Int32s, Int64s
 from .measuring import Measured, Points, patches
 
 _TWINS = 1.96 * math.sqrt(2)  # standard deviations within which 95 % of twins lie
@@ -30,8 +28,6 @@ _REACH = 3  # pitches to a parent at most
 _V_TH = (8, 4, 3, 2, 1)
 _TRIED = 3  # V_th by which pitches are compared
 _KEPT_BACK = 0.02  # of what is real, at most, by V_th
-_DOUBTS = (36, 32, 28, 24, 20, 16, 12, 8)
-_REJECTED = 0.04  # of what is real, at most, by the fold
 _RAY_CELLS = 100  # of a ray at most: its work grows with them
 _FOLDED = 100_000  # points that a threshold is tried on
 
@@ -57,10 +53,7 @@ def propose(points: Points, measured: Measured) -> list[Proposed]:
     """Values for the fields of `Config` that follow from the sensor."""
     judged = _judge(points, measured)
     out = [_delta(measured), *_placing(measured)]
-    fold = FoldConfig(delta=out[0].value)
-    out += _rays(measured, fold.delta)
-    fold = msgspec.structs.replace(fold, cell=out[-2].value, max_ray=out[-1].value)
-    out += _doubt(points, judged, fold)
+    out += _rays(measured, out[0].value)
     out += _graph(points, judged, measured)
     if measured.period >= Config().issuance.spread_from:
         value = round(measured.period, 2)
@@ -121,20 +114,6 @@ def _rays(measured: Measured, delta: float) -> list[Proposed]:
     ]
 
 
-def _doubt(points: Points, judged: _Judged, fold: FoldConfig) -> list[Proposed]:
-    """The largest doubt at which the fold keeps what other cycles confirm."""
-    rows = _foldable(points)
-    real = np.isin(rows, judged.real)
-    if not real.any():
-        return []
-    for doubt in _DOUBTS:
-        rejected = _rejected(points, rows, msgspec.structs.replace(fold, doubt=doubt))
-        if rejected[real].mean() <= _REJECTED:
-            break
-    says = _shares(rejected, real, np.isin(rows, judged.wrong))
-    return [Proposed("fold.doubt", doubt, f"the largest that hardly rejects what is real: {says}")]
-
-
 def _shares(dropped: Bools, real: Bools, wrong: Bools) -> str:
     """How much of what is real, and of what is wrong, is dropped."""
     text = f"{dropped[real].mean():.1%} of what other cycles confirm"
@@ -149,28 +128,6 @@ def _foldable(points: Points) -> Int64s:
     return np.asarray(rows[points.cycle[rows] % every == 0])
 
 
-def _rejected(points: Points, rows: Int64s, config: FoldConfig) -> Bools:
-    """(M,) whether the node of each row is rejected once all cycles are folded."""
-    fold, rays = DefaultFold(config), RayEvidence(config.cell_mm, config.max_ray_mm)
-    counts = np.zeros(int(points.robot.max()) + 1, np.int64)
-    numbers = np.zeros(len(rows), np.int64)
-    for start, end in _cycles(points, rows):
-        part = points.only(rows[start:end])
-        robot, n = int(part.robot[0]), end - start
-        block = _block(part, int(counts[robot]))
-        fold.apply(block)
-        bounds = np.array([0, n], np.int64)
-        rays.walk(robot, block.origin[:1], bounds, block.xyz, block.alive, +1)
-        numbers[start:end] = counts[robot] + np.arange(n)
-        counts[robot] += n
-    states = fold.evaluate(rays).states
-    nodes = np.zeros(len(rows), np.int64)
-    for robot in np.unique(points.robot[rows]).tolist():
-        mine = points.robot[rows] == robot
-        nodes[mine] = fold.feature_nodes(robot)[numbers[mine]]
-    return np.asarray(states[nodes] == State.REJECTED)
-
-
 def _cycles(points: Points, rows: Int64s) -> Iterator[tuple[int, int]]:
     """Where each cycle's rows begin and end."""
     edges = np.flatnonzero(np.diff(points.cycle[rows])) + 1
@@ -179,25 +136,6 @@ def _cycles(points: Points, rows: Int64s) -> Iterator[tuple[int, int]]:
 
 def _mm(metres: Floats) -> Int32s:
     return np.floor(1000 * metres + 0.5).astype(np.int32)
-
-
-def _block(part: Points, base: int) -> Block:
-    n = len(part)
-    return Block(
-        author=int(part.robot[0]),
-        base=base,
-        xyz=_mm(part.place),
-        alive=np.ones(n, np.bool_),
-        starts=np.array([0, n], np.int64),
-        cycle=np.full(1, part.cycle[0], np.int32),
-        color=np.zeros((n, 3), np.uint8),
-        colored=np.zeros(1, np.bool_),
-        parents=None,
-        cores=np.zeros(0, np.int64),
-        sightings=np.zeros(0, np.int64),
-        sighting_cycle=np.zeros(0, np.int32),
-        origin=_mm(part.place[:1] - part.ray[:1] * part.reach[:1, None]),
-    )
 
 
 def _graph(points: Points, judged: _Judged, measured: Measured) -> list[Proposed]:

@@ -3,6 +3,8 @@
 A further format is one more module in this folder, with a constant `UNDERSTANDS` (what to tell
 people it reads) and two functions: `matches(path) -> bool`, which looks no further than names, and
 `open(path, options) -> Source`. It is found by being there; a leading underscore hides a module.
+`lacks(path) -> str`, where there is one, says of a folder that nobody reads what is missing of a
+recording of this kind.
 """
 
 from __future__ import annotations
@@ -69,6 +71,9 @@ def _reader_of(path: Path) -> _Reader:
     for reader in readers:
         if reader.matches(path):
             return reader
+    for reader in readers:
+        if path.is_dir() and (said := getattr(reader, "lacks", lambda _: "")(path)):
+            raise RecordingError(f"{path}: {said}")
     known = " or ".join(reader.UNDERSTANDS for reader in readers)
     raise RecordingError(f"{path}: not a recording that DAGmap knows; it reads {known}")
 

@@ -10,9 +10,10 @@ from typing import Any, NamedTuple, TypeVar
 from ...model import RecordingError
 from ._ros import Unusable, boundless
 from ._rtabmap_msgs import register
-from ._salvage import Cut, Record, mcap_records, ros1_records
+from ._salvage import Cut, Record, db3_records, mcap_records, ros1_records
 from ._source import Skips
-from ._unpacking import Swollen, bound_rosbags
+from ._storage import PackedFolder, check_tables, packed_folder, storage_files
+from ._unpacking import ZSTD, Budget, Swollen, bound_reader, bound_rosbags, unpack_zstd
 
 T = TypeVar("T")
 _REMEDY = (
@@ -20,9 +21,10 @@ _REMEDY = (
     "--keep-going reads what is whole"
 )
 _UNPACK = (
-    "if you trust it, unpack it with other tools (`mcap decompress`, `rosbag decompress`) and read "
-    "that; --keep-going reads what lies before"
+    "if you trust it, unpack or sort it with other tools (`mcap decompress`, `mcap sort`, `rosbag "
+    "decompress`, `ros2 bag convert`) and read that; --keep-going reads what lies before"
 )
+_RECORDS = {".bag": ros1_records, ".mcap": mcap_records, ".db3": db3_records}
 
 
 class Topic(NamedTuple):
@@ -50,15 +52,18 @@ class Bag:
         bound_rosbags()
         self.ros2 = path.suffix != ".bag"
         self._salvaged = False
+        self._place = path  # where rosbags reads
+        self._packed: PackedFolder | None = None
         index = path / "metadata.yaml" if path.is_dir() else path
         if index.is_file() and not index.stat().st_size:
             raise RecordingError(f"{index}: an empty file; copy or record it anew")
         try:
+            self._unpack()
             self.topics, self._types = self._look()
         except Exception as error:  # noqa: BLE001  whatever a foreign parser raises on such bytes
             self._note("when it is opened", "damaged, cut short, or of another version", error)
             self._salvaged = True
-            self.topics, self._types = self._look_at_records()
+            self.topics, self._types = self._look_at_records(error)
         if (name := boundless(self._types.fielddefs)) is not None:
             raise RecordingError(
                 f"{path}: a definition repeats {name[:60]}, which is empty, so that a message may "
@@ -76,10 +81,11 @@ class Bag:
                 wanted = [c for c in reader.connections if c.topic in topics]
                 if not wanted:
                     return
+                bound_reader(reader, Budget(self._place))
                 for connection, stamp, raw in reader.messages(wanted):
                     count += 1
                     message = Message(connection.topic, connection.msgtype, stamp / 1e9, bytes(raw))
-                    yield message
+                    yield from self._plain(message)
         except RecordingError:
             raise
         except Exception as error:  # noqa: BLE001  see above
@@ -113,14 +119,41 @@ class Bag:
             said = f"{where} {error}; {_UNPACK}"
         self.skips.note(RecordingError(f"{self.path}: {said}"))
 
-    def _open(self) -> Any:
+    def _unpack(self) -> None:
+        """A folder that is packed is read from where it was unpacked to."""
+        packed = packed_folder(self.path)
+        if packed is None:
+            return
+        self._packed, self._place = packed, packed.path  # the one keeps the other in being
+        if packed.fault is not None:
+            raise packed.fault
+
+    def _plain(self, message: Message) -> Iterator[Message]:
+        """The message as it was sent: recorders may pack each by itself. None where it is damaged,
+        so that numbers of messages are those of every reading."""
+        if self.ros2 and message.raw.startswith(ZSTD):
+            try:
+                message = message._replace(raw=unpack_zstd(message.raw))
+            except Exception as error:  # noqa: BLE001  Swollen, or ZstdError of another module
+                fault = self.wrong(message, f"cannot be unpacked ({_first_line(error)})")
+                self.skips.note(fault)
+                return
+        yield message
+
+    def _defaults(self) -> Any:
         stores = self._typesys
         default = stores.get_typestore(stores.Stores.ROS2_HUMBLE)
         register(default, stores)
-        return self._rosbags.AnyReader([self.path], default_typestore=default)
+        return default
+
+    def _open(self) -> Any:
+        return self._rosbags.AnyReader([self._place], default_typestore=self._defaults())
 
     def _look(self) -> tuple[dict[str, Topic], Any]:
+        for file in storage_files(self._place):
+            check_tables(file)
         with self._open() as reader:
+            bound_reader(reader, Budget(self._place))
             found = {
                 name: Topic(info.msgtype or "", info.msgcount)
                 for name, info in reader.topics.items()
@@ -128,13 +161,18 @@ class Bag:
             return found, reader.typestore
 
     def _records(self) -> Iterator[Record]:
-        if self.path.suffix == ".bag":
-            return ros1_records(self.path)
-        if self.path.suffix == ".mcap":
-            return mcap_records(self.path)
-        return iter(())
+        """Of all files. Raises Cut at the end where one is damaged."""
+        cut = None
+        for file in storage_files(self._place):
+            try:
+                yield from _RECORDS[file.suffix](file)
+            except Cut as error:
+                cut = error
+        if cut is not None:
+            raise cut
 
-    def _look_at_records(self) -> tuple[dict[str, Topic], Any]:
+    def _look_at_records(self, error: Exception) -> tuple[dict[str, Topic], Any]:
+        """error: why rosbags did not open it."""
         kinds: dict[str, tuple[str, str]] = {}
         counts: dict[str, int] = {}
         try:
@@ -144,14 +182,17 @@ class Bag:
         except Cut:
             pass  # told of already
         if not counts:
-            raise RecordingError(f"{self.path}: nothing in it can be read; copy it anew")
-        types = self._typesys.get_typestore(self._typesys.Stores.EMPTY)
-        for kind, definition in kinds.values():
+            raise RecordingError(
+                f"{self.path}: nothing in it can be read ({_first_line(error)}); copy it anew"
+            )
+        stores, defined = self._typesys, [each for each in kinds.values() if each[1]]
+        types = stores.get_typestore(stores.Stores.EMPTY) if defined else self._defaults()
+        for kind, definition in defined:
             try:
-                types.register(self._typesys.get_types_from_msg(definition, kind))
-            except Exception as error:  # noqa: BLE001  see above
+                types.register(stores.get_types_from_msg(definition, kind))
+            except Exception as fault:  # noqa: BLE001  see above
                 self.skips.note(
-                    RecordingError(f"{self.path}: type {kind[:60]} ({_first_line(error)})")
+                    RecordingError(f"{self.path}: type {kind[:60]} ({_first_line(fault)})")
                 )
         return {name: Topic(kinds[name][0], count) for name, count in counts.items()}, types
 
@@ -159,7 +200,8 @@ class Bag:
         try:
             for record in self._records():
                 if record.topic in topics:
-                    yield Message(record.topic, record.kind, record.stamp / 1e9, record.data)
+                    stamp = record.stamp / 1e9
+                    yield from self._plain(Message(record.topic, record.kind, stamp, record.data))
         except Cut:
             return  # told of when the bag was opened
 

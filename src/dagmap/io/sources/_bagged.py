@@ -21,6 +21,7 @@ from ._rgbd import Camera, FrontEnd, Straight, import_cv2, load_camera
 from ._source import Options, Skips, checked
 
 _STORED = 200  # pictures that wait for their partner at most
+_STORED_BYTES = 1 << 29
 
 
 class BagPoses(SensorPoses):
@@ -189,10 +190,14 @@ class RgbdBag:
                 at += 1
                 for old in [c for c in colors if c < color]:
                     del colors[old]
-            if len(depths) + len(colors) > _STORED:
+            waiting = [*depths.values(), *colors.values()]
+            size = sum(len(each.raw) for each in waiting)
+            if len(waiting) > _STORED or size > _STORED_BYTES:
                 raise RecordingError(
-                    f"{self._bag.path}: {self._depth} and {self._color} lie more than "
-                    f"{_STORED // 2} pictures apart in the file; sort it with `ros2 bag convert`"
+                    f"{self._bag.path}: {self._depth} and {self._color}"
+                    " lie too far apart in the file: "
+                    f"{len(waiting)} pictures of {size} bytes wait for their partners at "
+                    f"{message.stamp:.6f} s; sort it with `ros2 bag convert`"
                 )
 
     def _check_sizes(self, depth: Message, metres: Floats, picture: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -9,7 +10,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-from ._unpacking import Swollen, unpack_bz2, unpack_lz4, unpacked
+from ._storage import rows_of
+from ._unpacking import Budget, Swollen, unpack_bz2, unpack_lz4, unpacked
 
 _MOST = 1 << 31  # bytes of a record
 _MAGIC = b"#ROSBAG V2.0\n"
@@ -36,16 +38,20 @@ def ros1_records(path: Path) -> Iterator[Record]:
         if file.read(len(_MAGIC)) != _MAGIC:
             raise Cut("it does not begin like a ROS 1 bag of version 2.0")
         known: dict[bytes, tuple[str, str, str]] = {}
+        budget = Budget(path)
         while file.peek(1):
             header, data = _ros1_record(file)
             if header.get(b"op") == _CHUNK:
-                yield from _ros1_chunk(header, data, known)
+                yield from _ros1_chunk(header, data, known, budget)
             else:
                 yield from _ros1_message(header, data, known)
 
 
 def _ros1_chunk(
-    header: dict[bytes, bytes], data: bytes, known: dict[bytes, tuple[str, str, str]]
+    header: dict[bytes, bytes],
+    data: bytes,
+    known: dict[bytes, tuple[str, str, str]],
+    budget: Budget,
 ) -> Iterator[Record]:
     name = header.get(b"compression", b"")
     unpack = _ROS1_PACKED.get(name)
@@ -53,6 +59,7 @@ def _ros1_chunk(
         raise Cut(f"a chunk is packed by {name[:20]!r}")
     try:
         data = unpack(data, int.from_bytes(header.get(b"size", b""), "little"))
+        budget.spend(len(data))
     except (OSError, EOFError, RuntimeError, ValueError, ImportError, Swollen) as error:
         raise Cut(f"a chunk cannot be unpacked ({error})") from None
     at = 0
@@ -138,7 +145,7 @@ def mcap_records(path: Path) -> Iterator[Record]:
     with path.open("rb") as file:
         try:
             reader = streams.StreamReader(file, record_size_limit=_MOST, emit_chunks=True)
-            for record in _in_chunks(reader.records, streams, kinds):
+            for record in _in_chunks(reader.records, streams, kinds, Budget(path)):
                 if isinstance(record, kinds.Schema):
                     schemas[record.id] = (record.name, record.data.decode("utf-8", "replace"))
                 elif isinstance(record, kinds.Channel):
@@ -152,11 +159,21 @@ def mcap_records(path: Path) -> Iterator[Record]:
             raise Cut(str(error) or type(error).__name__) from None
 
 
-def _in_chunks(found: Iterator[Any], streams: Any, kinds: Any) -> Iterator[Any]:
+def db3_records(path: Path) -> Iterator[Record]:
+    """The messages of a `.db3` in the order of the file. Raises Cut after the last whole one."""
+    try:
+        for topic, kind, definition, stamp, data in rows_of(path):
+            yield Record(topic, kind, definition, stamp, data)
+    except (sqlite3.Error, ValueError, TypeError, OSError) as error:
+        raise Cut(str(error)) from None
+
+
+def _in_chunks(found: Iterator[Any], streams: Any, kinds: Any, budget: Budget) -> Iterator[Any]:
     """Records, those in chunks too."""
     for record in found:
         if isinstance(record, kinds.Chunk):
             plain = replace(record, compression="", data=unpacked(record))
+            budget.spend(len(plain.data))
             yield from streams.breakup_chunk(plain)
         else:
             yield record

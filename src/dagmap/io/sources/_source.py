@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from ...model import ConfigError, Cycle, CycleError, RecordingError, quantise_cycle
 
+Row = tuple[int, list[str]]  # number of a line, from 1, and its words
+_S = TypeVar("_S")
+_T = TypeVar("_T")
 _TOLD = 20  # things that were left out and are told of one by one
 
 
@@ -74,20 +78,54 @@ class Description:
 
 @dataclass(slots=True)
 class Skips:
-    """What was left out of a recording, because `keep_going` says so."""
+    """What was left out of a recording, because `keep_going` says so; once, however often it is
+    read."""
 
     keep_going: bool
     told: list[str] = field(default_factory=list)
     count: int = 0
+    _known: set[int] = field(default_factory=set)
 
     def note(self, error: RecordingError) -> None:
         """Leave one thing out. Raises the error where that is not wanted."""
         if not self.keep_going:
             hint = "" if "--keep-going" in str(error) else "; --keep-going leaves it out"
             raise RecordingError(f"{error}{hint}") from None
+        if hash(str(error)) in self._known:
+            return
+        self._known.add(hash(str(error)))
         self.count += 1
         if len(self.told) < _TOLD:
             self.told.append(str(error))
+
+
+def readable(items: Iterable[_S], convert: Callable[[_S], _T], skips: Skips) -> list[_T]:
+    """What `convert` makes of lines or files, but for those at which it raises RecordingError."""
+    found = []
+    for item in items:
+        try:
+            found.append(convert(item))
+        except RecordingError as error:
+            skips.note(error)
+    return found
+
+
+def rising(items: Iterable[tuple[float, str, _T]], skips: Skips) -> list[_T]:
+    """Of (stamp, where it stands, item) those whose stamp comes after the one before."""
+    found: list[_T] = []
+    last = -math.inf
+    for stamp, where, item in items:
+        if stamp <= last:
+            skips.note(
+                RecordingError(
+                    f"{where}: the stamp {stamp} does not come after {last}; stamps must rise, "
+                    "sort the lines and drop doubles"
+                )
+            )
+            continue
+        last = stamp
+        found.append(item)
+    return found
 
 
 def folder_name(path: Path) -> str:
@@ -116,7 +154,13 @@ def read_bytes(path: Path) -> bytes:
         raise RecordingError(f"{path}: cannot be read ({error.strerror})") from None
 
 
-def read_rows(path: Path) -> list[tuple[int, list[str]]]:
+def shown(words: list[str]) -> str:
+    """Words of a line for an error: the first few, none of them long."""
+    parts = [repr(word[:30]) for word in words[:8]]
+    return f"[{', '.join(parts)}{', ...' if len(words) > 8 else ''}]"
+
+
+def read_rows(path: Path) -> list[Row]:
     """Rows of a text file of the TUM benchmark: (line number from 1, words). `#` is a comment."""
     try:
         text = read_bytes(path).decode()

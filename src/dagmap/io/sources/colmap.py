@@ -6,6 +6,7 @@ order of their names, a second each.
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from ._source import Description, Item, Options, Skips, checked, folder_name, re
 
 UNDERSTANDS = "a COLMAP model (points3D and images, .bin or .txt)"
 _PLACES = (".", "sparse/0", "sparse")
+_PARTS, _SUFFIXES = ("points3D", "images"), (".bin", ".txt")
 _NO_POINT = np.uint64(2**64 - 1)
 _MOST_NAME = 4096  # bytes
 _T = TypeVar("_T")
@@ -44,8 +46,14 @@ class _Points:
 
 
 def matches(path: Path) -> bool:
-    """Whether this is a folder of a model, or of a project with one in sparse/0."""
-    return path.is_dir() and _model(path) is not None
+    """Whether this is a folder of a model, or of a project with one in sparse/0; or binary half of
+    one, which nobody else should take for clouds."""
+    return path.is_dir() and (_model(path) is not None or bool(_half(path, _SUFFIXES[:1])))
+
+
+def lacks(path: Path) -> str:
+    """What is missing of a model."""
+    return _half(path)
 
 
 def open(path: Path, options: Options) -> ColmapModel:  # noqa: A001
@@ -72,7 +80,7 @@ class ColmapModel:
         self.skips = Skips(options.keep_going)
         found = _model(path)
         if found is None:
-            raise RecordingError(f"{path}: no points3D and images in it; check the path")
+            raise RecordingError(f"{path}: {_half(path)}")
         folder, suffix = found
         self._path = folder
         read_images, read_points = (_images_bin, _points_bin)
@@ -134,11 +142,21 @@ _Row: TypeAlias = tuple[int, tuple[float, ...], tuple[int, ...], float]  # id, p
 
 def _model(path: Path) -> tuple[Path, str] | None:
     for place in _PLACES:
-        for suffix in (".bin", ".txt"):
-            parts = (path / place / f"{name}{suffix}" for name in ("points3D", "images"))
-            if all(part.is_file() for part in parts):
+        for suffix in _SUFFIXES:
+            if all((path / place / f"{name}{suffix}").is_file() for name in _PARTS):
                 return path / place, suffix
     return None
+
+
+def _half(path: Path, suffixes: tuple[str, ...] = _SUFFIXES) -> str:
+    """What lacks where there is one part of a model without the other."""
+    for place in _PLACES:
+        for suffix in suffixes:
+            there = [n for n in _PARTS if (path / place / f"{n}{suffix}").is_file()]
+            if len(there) == 1:
+                lacking = _PARTS[1 - _PARTS.index(there[0])]
+                return f"no {lacking}{suffix} beside {there[0]}{suffix}; export the model anew"
+    return ""
 
 
 def _all(items: Iterator[_T], skips: Skips) -> list[_T]:
@@ -198,7 +216,7 @@ def _points_bin(path: Path) -> Iterator[_Row]:
 
 def _images_txt(path: Path) -> Iterator[_Picture]:
     """Two lines each; the second one may be empty."""
-    lines = _lines(path)
+    lines, count = _lines(path), 0
     for number, line in lines:
         where, words = f"{path}, line {number}", line.split()
         if len(words) < 10:
@@ -211,9 +229,12 @@ def _images_txt(path: Path) -> Iterator[_Picture]:
         except ValueError as error:
             raise RecordingError(f"{where}: {error}") from None
         yield _picture(where, " ".join(words[9:]), pose, ids)
+        count += 1
+    _check_count(path, count)
 
 
 def _points_txt(path: Path) -> Iterator[_Row]:
+    count = 0
     for number, line in _lines(path):
         words = line.split()
         if not words:
@@ -222,10 +243,21 @@ def _points_txt(path: Path) -> Iterator[_Row]:
             x, y, z, error = (float(words[i]) for i in (1, 2, 3, 7))
             red, green, blue = (min(max(int(word), 0), 255) for word in words[4:7])
             yield int(words[0]) % 2**64, (x, y, z), (red, green, blue), error
+            count += 1
         except (ValueError, IndexError):
             raise RecordingError(
                 f"{path}, line {number}: `id x y z r g b error track` is wanted"
             ) from None
+    _check_count(path, count)
+
+
+def _check_count(path: Path, count: int) -> None:
+    """COLMAP says in a comment how many there are: a text may end early at the end of a line."""
+    said = re.search(rb"^# Number of (?:images|points): (\d{1,18})\b", read_bytes(path), re.M)
+    if said and count < int(said[1]):
+        raise RecordingError(
+            f"{path}: {int(said[1])} are promised, {count} are there; it is cut short, copy it anew"
+        )
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,19 @@ from . import orbslam
 from ._odometry import PictureOdometry
 from ._poses import Trajectory, matrix, nearest
 from ._rgbd import FrontEnd, decode, import_cv2
-from ._source import Description, Item, Options, Skips, checked, folder_name, read_rows
+from ._source import (
+    Description,
+    Item,
+    Options,
+    Row,
+    Skips,
+    checked,
+    folder_name,
+    read_rows,
+    readable,
+    rising,
+    shown,
+)
 from ._stereo import Lens, Stereo, load_lens
 from ._trajectory import doubts, read_tum
 
@@ -84,7 +95,7 @@ class EurocFolder:
         self._cv2 = import_cv2(path)
         self._sizes = [lens.size for lens in lenses]
         self._stereo = Stereo(self._cv2, *lenses, self._mav)
-        left, right = (_pictures(self._mav / name) for name in ("cam0", "cam1"))
+        left, right = (_pictures(self._mav / name, self.skips) for name in ("cam0", "cam1"))
         pairs = _paired(left, right, self._mav)
         poses, self.notes = self._poses(lenses[0])
         self._pairs = [_Pair(a, b, None) for a, b in pairs]
@@ -106,7 +117,6 @@ class EurocFolder:
     def __iter__(self) -> Iterator[Cycle]:
         front = FrontEnd(self._cv2, self._stereo.camera, self._options)
         odometry = PictureOdometry(self._cv2, self._stereo.camera)
-        self.skips = Skips(self._options.keep_going)
         for pair in self._pairs:
             try:
                 picture, metres = self._stereo.rectified(
@@ -148,12 +158,12 @@ class EurocFolder:
         if named is not None:
             said = f"poses of {named}"
             if options.body_poses:
-                return read_tum(named), (f"{said}, those of the body",)
+                return read_tum(named, self.skips), (f"{said}, those of the body",)
             self._in_tracked = np.linalg.inv(lens.mounted) @ self._stereo.mounted
-            return read_tum(named), (said, *doubts(named, options.same_frame))
+            return read_tum(named, self.skips), (said, *doubts(named, options.same_frame))
         file = self._mav / _TRUTH / "data.csv"
         if file.is_file():
-            return _truth(file), (f"poses of {_TRUTH}",)
+            return _truth(file, self.skips), (f"poses of {_TRUTH}",)
         return None, (f"no {_TRUTH}: odometry by OpenCV",)
 
     def _read(self, picture: _Picture, camera: int) -> Uint8s:
@@ -178,30 +188,31 @@ def _count(folder: Path) -> int:
     return sum(1 for _ in folder.iterdir()) if folder.is_dir() else 0
 
 
-def _pictures(camera: Path) -> list[_Picture]:
+def _pictures(camera: Path, skips: Skips) -> list[_Picture]:
     """From data.csv, else from the names of the files, which are stamps in ns."""
-    listed, found = camera / "data.csv", []
+    listed = camera / "data.csv"
+
+    def picture(row: Row) -> _Picture:
+        number, words = row
+        line = f"{listed}, line {number}"
+        if len(words) != 2 or "/" in words[1]:
+            raise RecordingError(f"{line}: `stamp in ns,file` is wanted, not {shown(words)}")
+        return _Picture(_ns(words[0], line), camera / "data" / words[1], line)
+
     if listed.is_file():
-        for number, words in read_rows(listed):
-            line = f"{listed}, line {number}"
-            if len(words) != 2 or "/" in words[1]:
-                raise RecordingError(f"{line}: `stamp in ns,file` is wanted, not {words[:4]}")
-            found.append(_Picture(_ns(words[0], line), camera / "data" / words[1], line))
+        found = readable(read_rows(listed), picture, skips)
     else:
-        for file in (camera / "data").iterdir():
-            if not file.name.startswith("."):
-                line = f"{file} (name pictures by their stamps in ns, or write data.csv)"
-                found.append(_Picture(_ns(file.stem, line), file, ""))
-        found.sort(key=lambda picture: picture.stamp)
-    for before, after in pairwise(found):
-        if after.stamp <= before.stamp:
-            raise RecordingError(
-                f"{after.line or after.file}: the stamp {after.stamp} does not come after "
-                f"{before.stamp}; stamps must rise, sort the lines and drop doubles"
-            )
+        files = (file for file in (camera / "data").iterdir() if not file.name.startswith("."))
+        found = sorted(readable(files, _by_name, skips), key=lambda picture: picture.stamp)
+    found = rising(((p.stamp, p.line or str(p.file), p) for p in found), skips)
     if not found:
         raise RecordingError(f"{camera}: an empty recording; no pictures are named or there")
     return found
+
+
+def _by_name(file: Path) -> _Picture:
+    remedy = "name pictures by their stamps in ns, or write data.csv"
+    return _Picture(_ns(file.stem, f"{file} ({remedy})"), file, "")
 
 
 def _paired(
@@ -225,10 +236,12 @@ def _paired(
     return pairs
 
 
-def _truth(file: Path) -> Trajectory:
+def _truth(file: Path, skips: Skips) -> Trajectory:
     """Poses of the body: stamp in ns, place, quaternion with w first, and what follows."""
     out = Trajectory()
-    for number, words in read_rows(file):
+
+    def add(row: Row) -> None:
+        number, words = row
         line = f"{file}, line {number}"
         pose = None
         if len(words) >= 8:
@@ -242,6 +255,8 @@ def _truth(file: Path) -> Trajectory:
                 f"{line}: `stamp x y z qw qx qy qz` is wanted, the quaternion of length 1"
             )
         out.add(_ns(words[0], line) / 1e9, pose)
+
+    readable(read_rows(file), add, skips)
     if not len(out):
         raise RecordingError(f"{file}: no poses; remove the file for odometry by OpenCV")
     return out

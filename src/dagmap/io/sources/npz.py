@@ -21,7 +21,7 @@ import numpy.typing as npt
 from ...model import DESCRIPTOR, Cycle, CycleError, Int64s, RecordingError, quantise_cycle
 from ..export import atomic_write
 from ..npy import BROKEN, read_array, read_header, read_layout, read_members
-from ._source import Options, checked
+from ._source import Options, Skips, checked
 
 UNDERSTANDS = "a cycle stream (.npz)"
 VERSION = 1
@@ -58,28 +58,57 @@ def matches(path: Path) -> bool:
 
 def open(path: Path, options: Options) -> CycleStream:  # noqa: A001
     """Open a cycle stream. Raises RecordingError."""
-    return CycleStream(path)
+    return CycleStream(path, options)
 
 
 class CycleStream:
-    """The cycles of a file. All of it is checked before the first one comes out."""
+    """The cycles of a file. All of it is checked before the first one comes out; what `keep_going`
+    leaves out are whole cycles."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, options: Options) -> None:
         self.name, self._path = path.stem, path
+        self.skips = Skips(options.keep_going)
         try:
             self._arrays = _load(path)
         except BROKEN as error:  # RecordingError is none of these
             raise RecordingError(
                 f"{path}: truncated, damaged or no .npz file ({error}); copy or write it anew"
             ) from None
-        _check_values(path, self._arrays)
+        _check_layout(path, self._arrays)
+        self._kept = list(range(len(self._arrays["stamp"])))
+        try:
+            _check_values(path, self._arrays)
+        except RecordingError as error:
+            self.skips.note(error)
+            self._kept = self._usable()
+            if not self._kept:
+                raise
 
     def __len__(self) -> int:
-        return len(self._arrays["stamp"])
+        return len(self._kept)
 
     def __iter__(self) -> Iterator[Cycle]:
-        for i in range(len(self)):
-            yield checked(self._cycle(i), self._path)
+        for i in self._kept:
+            try:
+                cycle = checked(self._cycle(i), self._path)
+            except RecordingError as error:
+                self.skips.note(error)
+                continue
+            yield cycle
+
+    def _usable(self) -> list[int]:
+        """The cycles that an agent takes, by stamps that rise within their session."""
+        kept, last = [], dict[int, float]()
+        for i in range(len(self._arrays["stamp"])):
+            try:
+                cycle = checked(self._cycle(i), self._path)
+                if cycle.stamp <= last.get(cycle.session, -np.inf):
+                    continue
+            except (RecordingError, OverflowError):  # a number that no int64 holds
+                continue
+            last[cycle.session] = cycle.stamp
+            kept.append(i)
+        return kept
 
     def _cycle(self, i: int) -> Cycle:
         arrays = self._arrays
@@ -178,12 +207,16 @@ def _check_shape(
         raise RecordingError(f"{path}: {name} is {shape} {dtype}; {wanted} is wanted")
 
 
-def _check_values(path: Path, arrays: _Arrays) -> None:
+def _check_layout(path: Path, arrays: _Arrays) -> None:
+    """Whether each cycle has its rows."""
     if not len(arrays["stamp"]):
         raise RecordingError(f"{path}: an empty recording; it holds no cycle")
     for name, target in _OFFSETS.items():
         if name in arrays:
             _check_offsets(path, name, arrays[name], len(arrays[target]))
+
+
+def _check_values(path: Path, arrays: _Arrays) -> None:
     for name in ("stamp", "pose", "points", "moved_stamp", "moved_pose"):
         bad = ~np.isfinite(arrays.get(name, np.zeros(0)))
         if bad.any():

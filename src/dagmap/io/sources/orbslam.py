@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...model import Cycle, Floats, RecordingError, Uint8s
-from ._source import Description, Item, Options, Skips, checked, folder_name, read_rows
+from ._source import Description, Item, Options, Skips, checked, folder_name, read_rows, shown
 from ._stereo import load_lens
 from ._trajectory import doubts, read_tum
 from .scans import READERS
@@ -33,6 +33,16 @@ _NOBODY = -1
 def matches(path: Path) -> bool:
     """Whether this is a folder with a trajectory of key frames and map points."""
     return path.is_dir() and _files(path) is not None
+
+
+def lacks(path: Path) -> str:
+    """What is missing of a map."""
+    trajectories, points = _parts(path)
+    if points and not trajectories:
+        return f"no KeyFrameTrajectory.txt beside {points[0].name}; have ORB-SLAM3 save it"
+    if trajectories and not points:
+        return f"no MapPoints.txt beside {trajectories[0].name}; write a line `x y z` for each"
+    return ""
 
 
 def open(path: Path, options: Options) -> OrbSlamMap:  # noqa: A001
@@ -61,7 +71,7 @@ class OrbSlamMap:
             raise RecordingError(f"{path}: no KeyFrameTrajectory.txt and MapPoints.txt in it")
         self.name, self.files, self._options = folder_name(path), found, options
         self.skips = Skips(options.keep_going)
-        self._stamps, self._poses = read_tum(found[0]).all()
+        self._stamps, self._poses = read_tum(found[0], self.skips).all()
         whose = self._bring_to_camera(path)
         points, colors = self._read(found[1])
         seen = np.isfinite(points).all(axis=1)
@@ -117,7 +127,9 @@ class OrbSlamMap:
                 names = not rows and all(word.isalpha() for word in words)  # of the columns
                 if not names:
                     where = f"{file}, line {number}"
-                    self.skips.note(RecordingError(f"{where}: `x y z` is wanted, not {words[:3]}"))
+                    self.skips.note(
+                        RecordingError(f"{where}: `x y z` is wanted, not {shown(words[:3])}")
+                    )
         return np.array(rows, np.float64).reshape(-1, 3), None
 
 
@@ -129,6 +141,11 @@ def _place(words: list[str]) -> list[float]:
 
 def _files(path: Path) -> tuple[Path, Path] | None:
     """The trajectory of the key frames and the points."""
+    trajectories, points = _parts(path)
+    return (trajectories[0], points[0]) if trajectories and points else None
+
+
+def _parts(path: Path) -> tuple[list[Path], list[Path]]:
     trajectories = [file for name in _TRAJECTORIES for file in sorted(path.glob(name))]
     suffixes = {*_TEXTS, ".ply", ".pcd"}
     points = [
@@ -136,7 +153,7 @@ def _files(path: Path) -> tuple[Path, Path] | None:
         for file in sorted(path.iterdir())
         if file.suffix.lower() in suffixes and file.stem.lower().replace("_", "") in _POINTS
     ]
-    return (trajectories[0], points[0]) if trajectories and points else None
+    return trajectories, points
 
 
 def _owners(points: Floats, poses: Floats, options: Options) -> npt.NDArray[np.int64]:

@@ -16,6 +16,7 @@ from ._bagged import BagPoses, CloudBag, RgbdBag
 from ._mapped import MapDataBag
 from ._rtabmap_msgs import MAP_DATA, MAP_GRAPH
 from ._source import Description, Item, Options, Skips, Source
+from ._storage import storage_files
 
 UNDERSTANDS = "a ROS bag (.bag, .mcap, .db3, or the folder of one)"
 _SUFFIXES = (".bag", ".mcap", ".db3")
@@ -27,6 +28,17 @@ def matches(path: Path) -> bool:
     if path.is_file():
         return path.suffix in _SUFFIXES
     return (path / "metadata.yaml").is_file()
+
+
+def lacks(path: Path) -> str:
+    """What is missing of the folder of a bag."""
+    files = storage_files(path)
+    if not files:
+        return ""
+    return (
+        f"files of a bag ({files[0].name} ...), but no metadata.yaml, in which their order stands; "
+        "name a file itself, or run `ros2 bag reindex` on the folder"
+    )
 
 
 @dataclass(frozen=True, slots=True)

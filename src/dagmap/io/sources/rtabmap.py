@@ -19,11 +19,13 @@ import numpy as np
 
 from ...model import Cycle, Floats, RecordingError
 from ._source import Description, Item, Options, Skips, checked
+from ._storage import DAMAGED, SQLITE, cut_short, one_line, require_plain
 
 UNDERSTANDS = "an RTAB-Map database (.db)"
 _NODES = "SELECT id, map_id, stamp, pose FROM Node WHERE id > 0 ORDER BY id"
 _FEATURES = """SELECT depth_x, depth_y, depth_z FROM Feature WHERE node_id = ?
     AND depth_x IS NOT NULL ORDER BY response DESC, rowid LIMIT ?"""
+_TABLES = ("Node", "Feature", "Admin")
 _COUNT = "SELECT count(*) FROM Feature WHERE depth_x IS NOT NULL"
 UINT8, _INT32, _FLOAT32 = 0, 4, 5  # OpenCV's types, one channel
 _TYPES: dict[int, np.dtype[Any]] = {
@@ -33,7 +35,6 @@ _TYPES: dict[int, np.dtype[Any]] = {
 }
 _AFTER = 1e-3  # s after the last node: when a mere correction is dated
 _MOST_SMALLER = 1100  # zlib makes nothing smaller than by this factor
-_MAGIC = b"SQLite format 3\0"
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +77,8 @@ class RtabmapDatabase:
         self.skips = Skips(options.keep_going)
         _check_size(path, self.skips)
         with _database(path) as database:
+            if options.keep_going:
+                database.execute(DAMAGED)
             self.version = _version(path, database)
             optimised = self._optimised(database)
             self._nodes = self._read_nodes(database, optimised)
@@ -95,6 +98,8 @@ class RtabmapDatabase:
     def _cycles(self) -> Iterator[Cycle]:
         given: list[_Node] = []  # what is left out cannot be moved
         with _database(self._path) as database:
+            if self._options.keep_going:
+                database.execute(DAMAGED)
             for i, node in enumerate(self._nodes):
                 last = i == len(self._nodes) - 1
                 rows = database.execute(_FEATURES, (node.id, 4 * self._options.max_features))
@@ -125,7 +130,8 @@ class RtabmapDatabase:
             return np.array(rows, np.float64).reshape(-1, 3)
         except (TypeError, ValueError) as error:
             raise RecordingError(
-                f"{self._path}: node {node.id}: a position is no number ({error}); copy it anew"
+                f"{self._path}: node {node.id}: a position is no number ({one_line(error)}); copy "
+                "it anew"
             ) from None
 
     def _chosen(self, points: Floats) -> Floats:
@@ -140,7 +146,7 @@ class RtabmapDatabase:
         self, database: sqlite3.Connection, optimised: dict[int, Floats]
     ) -> list[_Node]:
         """Of several sessions those in one frame: that of the optimisation, where there is one."""
-        rows = database.execute(_NODES).fetchall()
+        rows = self._rows(database)
         together = len({map_id for _, map_id, _, _ in rows}) > 1 and bool(optimised)
         nodes: list[_Node] = []
         last: dict[int, float] = {}
@@ -156,8 +162,8 @@ class RtabmapDatabase:
             if not rising:
                 self.skips.note(
                     RecordingError(
-                        f"{self._path}: node {id_}: its stamp {stamp!r} does not come after "
-                        f"{last.get(session)}, that of the node before"
+                        f"{self._path}: node {id_}: its stamp {repr(stamp)[:40]} does not come "
+                        f"after {last.get(session)}, that of the node before"
                     )
                 )
                 continue
@@ -165,6 +171,21 @@ class RtabmapDatabase:
             moved = None if together else optimised.get(id_)
             nodes.append(_Node(id_, session, float(stamp), pose, moved))
         return nodes
+
+    def _rows(self, database: sqlite3.Connection) -> list[tuple[Any, ...]]:
+        """Of the nodes, as far as SQLite can read them where that is asked for."""
+        rows: list[tuple[Any, ...]] = []
+        try:
+            rows.extend(database.execute(_NODES))
+        except sqlite3.DatabaseError as error:
+            if not rows:
+                raise
+            self.skips.note(
+                RecordingError(
+                    f"{self._path}: Node: damaged after {len(rows)} nodes ({one_line(error)})"
+                )
+            )
+        return rows
 
     def _optimised(self, database: sqlite3.Connection) -> dict[int, Floats]:
         columns = {row[1] for row in database.execute("PRAGMA table_info(Admin)")}
@@ -241,33 +262,30 @@ def _database(path: Path) -> Iterator[sqlite3.Connection]:
     """Read only. Raises RecordingError for whatever SQLite says."""
     try:
         with path.open("rb") as file:
-            head = file.read(len(_MAGIC))
-        if head != _MAGIC:
+            head = file.read(len(SQLITE))
+        if head != SQLITE:
             raise RecordingError(f"{path}: no SQLite database, or an empty file; copy it anew")
         uri = f"{path.resolve().as_uri()}?mode=ro"
         with closing(sqlite3.connect(uri, uri=True)) as database:
             yield database
     except (sqlite3.Error, OSError, OverflowError, UnicodeDecodeError) as error:
         raise RecordingError(
-            f"{path}: damaged, cut short, or not of RTAB-Map ({error}); copy it anew, or run "
-            "rtabmap-recovery on it"
+            f"{path}: damaged, cut short, or not of RTAB-Map ({one_line(error)}); copy it anew, or "
+            "run rtabmap-recovery on it"
         ) from None
 
 
 def _check_size(path: Path, skips: Skips) -> None:
     """SQLite itself misses what was cut off only where it looks for it."""
     try:
-        with path.open("rb") as file:
-            head, size = file.read(32), path.stat().st_size
+        lacking = cut_short(path)
     except OSError:
         return  # `_database` tells
-    page = int.from_bytes(head[16:18], "big")
-    promised = int.from_bytes(head[28:32], "big") * (1 << 16 if page == 1 else page)
-    if head.startswith(_MAGIC) and size < promised:
+    if lacking:
         skips.note(
             RecordingError(
-                f"{path}: damaged, cut short: {promised} bytes are promised, {size} are there; "
-                "copy it anew, or run rtabmap-recovery on it"
+                f"{path}: damaged, cut short: {lacking}; copy it anew, or run rtabmap-recovery "
+                "on it"
             )
         )
 
@@ -281,8 +299,14 @@ def _version(path: Path, database: sqlite3.Connection) -> str:
             f"{path}: of RTAB-Map before 0.13; open it once with a newer rtabmap-databaseViewer "
             "and save it"
         )
-    missing = [name for name in ("Node", "Feature", "Admin") if name not in tables]
+    missing = [name for name in _TABLES if name not in tables]
     if missing:
         raise RecordingError(f"{path}: no table {missing[0]}, so no database of RTAB-Map")
+    try:
+        require_plain(database, _TABLES)
+    except ValueError as error:
+        raise RecordingError(
+            f"{path}: {one_line(error)}; copy it anew, or have RTAB-Map save it"
+        ) from None
     row = database.execute("SELECT version FROM Admin").fetchone()
     return "of unknown version" if row is None else str(row[0])[:20]

@@ -9,9 +9,9 @@ where KITTI's poses are those of its camera. Without poses: odometry by KISS-ICP
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from itertools import pairwise
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -25,11 +25,13 @@ from ._source import (
     Description,
     Item,
     Options,
+    Row,
     Skips,
     checked,
     folder_name,
     read_bytes,
     read_rows,
+    rising,
 )
 from ._trajectory import numbers, read_tum
 
@@ -39,6 +41,7 @@ _SUFFIXES = (".bin", ".pcd", ".ply")
 _PERIOD = 0.1  # s between scans without stamps: what most LiDARs do
 _WHOLE_KITTI = 4  # numbers of a point: x y z and the reflectance
 _COLORS = ("red", "green", "blue")
+_T = TypeVar("_T")
 _FITS = np.dtype([(name, "u1") for name in _COLORS])
 
 
@@ -71,8 +74,7 @@ class ScanFolder:
     def __init__(self, path: Path, options: Options) -> None:
         self.name, self._path, self._options = folder_name(path), path, options
         self.skips = Skips(options.keep_going)
-        clouds = _clouds(path)
-        stamps = _stamps(path, clouds)
+        stamps, clouds = _stamps(path, _clouds(path), self.skips)
         file = path / "poses.txt" if options.poses is None else options.poses
         self.dropped = 0
         self.notes: tuple[str, ...] = (f"poses of {file}",)
@@ -109,22 +111,29 @@ class ScanFolder:
         rows = read_rows(file)
         if rows and len(rows[0][1]) == 8:
             return self._by_stamp(file, stamps, clouds)
-        poses = _kitti_poses(file, rows, self._path)
-        if len(poses) != len(clouds):
-            self.skips.note(
-                RecordingError(
-                    f"{file}: {len(poses)} poses for {len(clouds)} clouds; one a cloud is wanted, "
-                    "in the order of the clouds' names"
-                )
+        self._require_mounted(clouds)
+        poses = _kitti_poses(file, rows, self._path, self.skips)
+        pairs = _aligned(file, "poses", len(poses), clouds, self.skips)
+        self.dropped = len(clouds) - len(pairs)
+        stamps = stamps or _even(len(clouds))
+        at = dict(zip(clouds, stamps, strict=True))
+        return [at[c] for c, _ in pairs], [c for c, _ in pairs], [poses[i] for _, i in pairs]
+
+    def _require_mounted(self, clouds: list[Path]) -> None:
+        """KITTI's poses are those of its camera."""
+        file = self._path / "calib.txt"
+        kitti = clouds[0].suffix == ".bin" and clouds[0].parent.name == "velodyne"
+        if kitti and not file.is_file() and not self._options.same_frame:
+            raise RecordingError(
+                f"{file}: missing; KITTI's poses are those of its camera, so copy the sequence's "
+                "calib.txt (Tr: from the LiDAR to it), or say --same-frame if the poses are the "
+                "LiDAR's"
             )
-        count = min(len(poses), len(clouds))
-        self.dropped = len(clouds) - count
-        return (stamps or _even(len(clouds)))[:count], clouds[:count], poses[:count]
 
     def _by_stamp(
         self, file: Path, stamps: list[float] | None, clouds: list[Path]
     ) -> tuple[list[float], list[Path], list[Floats]]:
-        trajectory = read_tum(file)
+        trajectory = read_tum(file, self.skips)
         if stamps is None:
             raise RecordingError(
                 f"{self._path}: {file.name} goes by stamps, but the clouds have none; name them by "
@@ -162,38 +171,61 @@ def _even(count: int) -> list[float]:
     return [_PERIOD * i for i in range(count)]
 
 
-def _stamps(path: Path, clouds: list[Path]) -> list[float] | None:
-    """From times.txt, else from names such as 1305031102.175304; None where there are none."""
+def _stamps(path: Path, clouds: list[Path], skips: Skips) -> tuple[list[float] | None, list[Path]]:
+    """From times.txt, else from names such as 1305031102.175304; None where there are none. And the
+    clouds that have one."""
     file = path / "times.txt"
     if file.is_file():
-        rows = read_rows(file)
-        stamps = [numbers(file, number, words, 1)[0] for number, words in rows]
-        if len(stamps) != len(clouds):
-            raise RecordingError(
-                f"{file}: {len(stamps)} stamps for {len(clouds)} clouds; one a line is wanted"
-            )
-        _require_rising(file, stamps)
-        return stamps
+        stamps = _in_order(read_rows(file), lambda row: numbers(file, *row, 1)[0], skips)
+        pairs = _aligned(file, "stamps", len(stamps), clouds, skips)
+        rows = ((stamps[i], f"{file}, stamp {i + 1}", (stamps[i], cloud)) for cloud, i in pairs)
+        kept = rising(rows, skips)
+        if not kept:
+            raise RecordingError(f"{file}: no stamps; one a line is wanted, or remove the file")
+        return [stamp for stamp, _ in kept], [cloud for _, cloud in kept]
     if all(re.fullmatch(r"\d+\.\d+", cloud.stem) for cloud in clouds):
-        return [float(cloud.stem) for cloud in clouds]
-    return None
+        return [float(cloud.stem) for cloud in clouds], clouds
+    return None, clouds
 
 
-def _require_rising(file: Path, stamps: list[float]) -> None:
-    for i, (a, b) in enumerate(pairwise(stamps)):
-        if b <= a:
-            raise RecordingError(
-                f"{file}: stamp {i + 2}, {b}, does not come after {a}; stamps must rise"
-            )
+def _in_order(rows: list[Row], convert: Callable[[Row], _T], skips: Skips) -> list[_T]:
+    """Of lines that count by their number: those before the first that cannot be read."""
+    found: list[_T] = []
+    try:
+        for row in rows:
+            found.append(convert(row))
+    except RecordingError as error:
+        skips.note(error)
+    return found
 
 
-def _kitti_poses(file: Path, rows: list[tuple[int, list[str]]], path: Path) -> list[Floats]:
+def _aligned(
+    file: Path, what: str, count: int, clouds: list[Path], skips: Skips
+) -> list[tuple[Path, int]]:
+    """Clouds with the number of their line. Where there are not as many lines as clouds, the number
+    in the cloud's name counts, as KITTI has it."""
+    if count == len(clouds):
+        return [(cloud, i) for i, cloud in enumerate(clouds)]
+    fault = RecordingError(
+        f"{file}: {count} {what} for {len(clouds)} clouds; one a cloud is wanted, in the order of "
+        "the clouds' names"
+    )
+    if all(re.fullmatch(r"\d{1,9}", cloud.stem) for cloud in clouds):
+        skips.note(fault)
+        return [(cloud, int(cloud.stem)) for cloud in clouds if int(cloud.stem) < count]
+    if count > len(clouds):
+        raise fault  # which cloud is missing cannot be told
+    skips.note(fault)
+    return [(cloud, i) for i, cloud in enumerate(clouds[:count])]
+
+
+def _kitti_poses(file: Path, rows: list[Row], path: Path, skips: Skips) -> list[Floats]:
     """(4, 4) each: of the LiDAR, where calib.txt says how it is mounted to KITTI's camera."""
     poses = []
     mounted = _calibration(path / "calib.txt")
-    for number, words in rows:
+    for values in _in_order(rows, lambda row: numbers(file, *row, 12), skips):
         pose = np.eye(4)
-        pose[:3] = np.reshape(numbers(file, number, words, 12), (3, 4))
+        pose[:3] = np.reshape(values, (3, 4))
         with np.errstate(over="ignore", invalid="ignore"):  # what is no pose is refused later
             poses.append(inverse(mounted) @ pose @ mounted)
     if not poses:

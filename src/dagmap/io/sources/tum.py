@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,17 @@ from ...model import Cycle, Floats, RecordingError
 from ._odometry import PictureOdometry
 from ._poses import SLACK, matrix, nearest
 from ._rgbd import FrontEnd, import_cv2, load_camera
-from ._source import Options, Skips, checked, folder_name, read_rows
+from ._source import (
+    Options,
+    Row,
+    Skips,
+    checked,
+    folder_name,
+    read_rows,
+    readable,
+    rising,
+    shown,
+)
 
 UNDERSTANDS = "a TUM RGB-D folder (rgb/, depth/, camera.json, groundtruth.txt)"
 _PARTS = ("rgb", "depth", "groundtruth.txt", "associations.txt", "rgb.txt", "depth.txt")
@@ -66,7 +75,7 @@ class TumFolder:
             )
         self._camera = load_camera(own if named is None else named)
         self._cv2 = import_cv2(path)
-        frames = _frames(path)
+        frames = _frames(path, self.skips)
         self._placed = self._with_poses(frames, path / "groundtruth.txt")
         self.dropped = len(frames) - len(self._placed)
 
@@ -75,7 +84,6 @@ class TumFolder:
 
     def __iter__(self) -> Iterator[Cycle]:
         front = FrontEnd(self._cv2, self._camera, self._options)
-        self.skips = Skips(self._options.keep_going)
         odometry = PictureOdometry(self._cv2, self._camera)
         for frame, pose in self._placed:
             try:
@@ -97,7 +105,7 @@ class TumFolder:
         if not file.exists():
             self.notes = ("no groundtruth.txt: odometry by OpenCV",)
             return [(frame, None) for frame in frames]
-        placed = _placed(frames, file)
+        placed = _placed(frames, file, self.skips)
         if not placed:
             raise RecordingError(
                 f"{self._path}: none of {len(frames)} frames has a pose within 20 ms in "
@@ -106,19 +114,22 @@ class TumFolder:
         return placed
 
 
-def _frames(path: Path) -> list[_Frame]:
+def _frames(path: Path, skips: Skips) -> list[_Frame]:
     """All pairs of pictures by the stamp of the depth."""
     named = path / "associations.txt"
-    frames = _associated(path, named) if named.exists() else _matched(path)
+    listed = _associated(path, named, skips) if named.exists() else _matched(path, skips)
+    frames = []
+    for frame in listed:
+        missing = [file for file in (frame.color, frame.depth) if not _is_file(file)]
+        if missing:
+            by = f", named in {frame.line}" if frame.line else ""
+            skips.note(RecordingError(f"{missing[0]}: missing{by}; copy it or drop its frame"))
+        else:
+            frames.append(frame)
     if not frames:
         raise RecordingError(
             f"{path}: an empty recording; no picture in rgb/ has one in depth/ within 20 ms"
         )
-    for frame in frames:
-        for picture in (frame.color, frame.depth):
-            if not _is_file(picture):
-                by = f", named in {frame.line}" if frame.line else ""
-                raise RecordingError(f"{picture}: missing{by}; copy it or drop its frame")
     return frames
 
 
@@ -129,22 +140,24 @@ def _is_file(picture: Path) -> bool:
         return False
 
 
-def _associated(path: Path, file: Path) -> list[_Frame]:
+def _associated(path: Path, file: Path, skips: Skips) -> list[_Frame]:
     """The frames that associations.txt names: stamp, rgb, stamp, depth."""
-    frames: list[_Frame] = []
-    for number, words in read_rows(file):
+
+    def frame(row: Row) -> _Frame:
+        number, words = row
         line = f"{file}, line {number}"
         if len(words) != 4:
-            raise RecordingError(f"{line}: `stamp rgb stamp depth` is wanted, not {words}")
+            raise RecordingError(f"{line}: `stamp rgb stamp depth` is wanted, not {shown(words)}")
         _number(words[0], line)
-        frames.append(_Frame(_number(words[2], line), path / words[1], path / words[3], line))
-    _require_rising([(frame.stamp, frame.line) for frame in frames])
-    return frames
+        return _Frame(_number(words[2], line), path / words[1], path / words[3], line)
+
+    frames = readable(read_rows(file), frame, skips)
+    return rising(((frame.stamp, frame.line, frame) for frame in frames), skips)
 
 
-def _matched(path: Path) -> list[_Frame]:
+def _matched(path: Path, skips: Skips) -> list[_Frame]:
     """Each depth picture with the nearest colour picture, if each is the other's nearest."""
-    colors, depths = _list(path, "rgb"), _list(path, "depth")
+    colors, depths = _list(path, "rgb", skips), _list(path, "depth", skips)
     if not colors or not depths:
         return []
     color_stamps = np.array([stamp for stamp, _ in colors])
@@ -157,32 +170,33 @@ def _matched(path: Path) -> list[_Frame]:
     return frames
 
 
-def _list(path: Path, part: str) -> list[tuple[float, Path]]:
+def _list(path: Path, part: str, skips: Skips) -> list[tuple[float, Path]]:
     """(stamp, picture) from rgb.txt or depth.txt, else from the names of the files."""
     file = path / f"{part}.txt"
-    rows: list[tuple[float, str]] = []
-    pictures: list[tuple[float, Path]] = []
+
+    def named(row: Row) -> tuple[float, str, tuple[float, Path]]:
+        number, words = row
+        line = f"{file}, line {number}"
+        if len(words) != 2:
+            raise RecordingError(f"{line}: `stamp file` is wanted, not {shown(words)}")
+        stamp = _number(words[0], line)
+        return stamp, line, (stamp, path / words[1])
+
     if file.exists():
-        for number, words in read_rows(file):
-            line = f"{file}, line {number}"
-            if len(words) != 2:
-                raise RecordingError(f"{line}: `stamp file` is wanted, not {words}")
-            rows.append((_number(words[0], line), line))
-            pictures.append((rows[-1][0], path / words[1]))
-        _require_rising(rows)
-        return pictures
+        return rising(readable(read_rows(file), named, skips), skips)
     remedy = f"name files by their stamp, or write {part}.txt or associations.txt"
-    for picture in (path / part).iterdir():
-        if picture.is_file() and not picture.name.startswith("."):
-            pictures.append((_number(picture.stem, f"{picture} ({remedy})"), picture))
-    pictures.sort()
-    _require_rising([(stamp, str(picture)) for stamp, picture in pictures])
-    return pictures
+
+    def by_name(picture: Path) -> tuple[float, Path]:
+        return _number(picture.stem, f"{picture} ({remedy})"), picture
+
+    files = (f for f in (path / part).iterdir() if f.is_file() and not f.name.startswith("."))
+    pictures = sorted(readable(files, by_name, skips))
+    return rising(((stamp, str(file), (stamp, file)) for stamp, file in pictures), skips)
 
 
-def _placed(frames: list[_Frame], file: Path) -> list[tuple[_Frame, Floats | None]]:
+def _placed(frames: list[_Frame], file: Path, skips: Skips) -> list[tuple[_Frame, Floats | None]]:
     """The frames with the pose nearest to their depth, where one lies within 20 ms."""
-    stamps, poses = _trajectory(file)
+    stamps, poses = _trajectory(file, skips)
     closest = nearest(stamps, np.array([frame.stamp for frame in frames]))
     return [
         (frame, poses[i])
@@ -191,20 +205,22 @@ def _placed(frames: list[_Frame], file: Path) -> list[tuple[_Frame, Floats | Non
     ]
 
 
-def _trajectory(file: Path) -> tuple[Floats, Floats]:
+def _trajectory(file: Path, skips: Skips) -> tuple[Floats, Floats]:
     """Stamps (M,) and poses (M, 4, 4) of groundtruth.txt: stamp tx ty tz qx qy qz qw."""
-    stamps, poses = [], []
-    for number, words in read_rows(file):
+    wanted = "`stamp tx ty tz qx qy qz qw` is wanted"
+
+    def placed(row: Row) -> tuple[float, str, tuple[float, Floats]]:
+        number, words = row
         line = f"{file}, line {number}"
         if len(words) != 8:
-            raise RecordingError(f"{line}: `stamp tx ty tz qx qy qz qw` is wanted, not {words}")
+            raise RecordingError(f"{line}: {wanted}, not {shown(words)}")
         stamp, *values = (_number(word, line) for word in words)
-        stamps.append((stamp, line))
-        poses.append(_pose(values, line))
-    if not stamps:
+        return stamp, line, (stamp, _pose(values, line))
+
+    rows = rising(readable(read_rows(file), placed, skips), skips)
+    if not rows:
         raise RecordingError(f"{file}: no poses; a line `stamp tx ty tz qx qy qz qw` each")
-    _require_rising(stamps)
-    return np.array([stamp for stamp, _ in stamps]), np.array(poses)
+    return np.array([stamp for stamp, _ in rows]), np.array([pose for _, pose in rows])
 
 
 def _pose(values: list[float], line: str) -> Floats:
@@ -224,14 +240,5 @@ def _number(word: str, line: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise RecordingError(f"{line}: {word!r} is not a finite number")
+        raise RecordingError(f"{line}: {word[:40]!r} is not a finite number")
     return value
-
-
-def _require_rising(stamps: list[tuple[float, str]]) -> None:
-    for (before, _), (stamp, line) in pairwise(stamps):
-        if stamp <= before:
-            raise RecordingError(
-                f"{line}: the stamp {stamp} does not come after {before}; stamps must rise, sort "
-                "the lines and drop doubles"
-            )
