@@ -99,7 +99,8 @@ def align(source: Surfels, target: Surfels) -> Working[list[Agreement]]:
     """Ways in which the source may lie in the target, refined and distinct, the best first."""
     proposals: list[tuple[int, Floats]] = []
     rows = _sample(source)
-    for turn in _rotations(source.axes, target.axes):
+    turns = yield from _rotations(source.axes, target.axes)
+    for turn in turns:
         found = yield from _shifts(source, target, turn, rows)
         proposals += found
     proposals.sort(key=lambda proposal: -proposal[0])
@@ -122,7 +123,7 @@ def _sample(source: Surfels) -> Int64s:
     return np.unique(np.searchsorted(total, wanted))
 
 
-def _rotations(here: Floats, there: Floats) -> list[Floats]:
+def _rotations(here: Floats, there: Floats) -> Working[list[Floats]]:
     """Rotations (3, 3) that bring two axes onto two others, either way, without those alike."""
     out: list[Floats] = []
     for a, b in _pairs(there):
@@ -137,6 +138,7 @@ def _rotations(here: Floats, there: Floats) -> list[Floats]:
                     out.append(turn)
                 if len(out) >= _ROTATIONS:
                     return out
+        yield 8
     return out
 
 
