@@ -404,7 +404,7 @@ def test_keyframes_of_anchors_that_never_come_keep_nobody_elses_out() -> None:
         ledger.add(tx)
     for order in (sorted, lambda chains: sorted(chains, reverse=True)):
         ledger.chains = {author: ledger.chains[author] for author in order(ledger.chains)}
-        placing = Placing(UNKNOWN.placing, bob.identity.author)
+        placing = Placing(UNKNOWN, bob.identity.author)
         placing._take_in(ledger, Consensus(UNKNOWN))  # as in a revision: no anchor is known yet
         placing._take_in(ledger, bob.consensus)
         assert sum(map(len, placing._keyframes.values())) == 12
@@ -419,7 +419,7 @@ def test_a_robot_that_started_often_is_still_placed() -> None:
         anchors = tuple(replace(anchor(cycle), session=session) for cycle in cycles)
         shown = tuple(Described(cycle, *one) for cycle in cycles)
         chain.append(robot.make(payload=Payload(anchors=anchors, described=shown)))
-    consensus, placing = Consensus(UNKNOWN), Placing(UNKNOWN.placing, robot.identity.author)
+    consensus, placing = Consensus(UNKNOWN), Placing(UNKNOWN, robot.identity.author)
     for tx in chain:
         ledger.add(tx)
         consensus.add(tx)

@@ -71,7 +71,7 @@ class Agent:
         self.consensus = Consensus(self.config, identity.salt)
         self.observing = Observing(self.config, identity.author, identity.salt)
         self.sync = Sync(self.ledger, self.config, identity.author)
-        self.placing = Placing(self.config.placing, identity.author)
+        self.placing = Placing(self.config, identity.author)
         self.steering = Steering(self.config, identity.author)
         self.listening = False  # to be told of its own chain first: nothing is issued meanwhile
         self._map: WorldMap | None = None

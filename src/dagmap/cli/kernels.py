@@ -56,6 +56,18 @@ def warm_graph_and_codec() -> None:
     decode_features(data, 12, 2, 0, starts, one)
     count_children(one, parents, 1)
     match(np.zeros((2, 32), np.uint8), np.ones((2, 32), np.uint8))
+    warm_surfaces()
+
+
+def warm_surfaces() -> None:
+    """Compile what lays surfaces on each other."""
+    from ..kernels.voxels import nearest_facing, pass_through, tally
+
+    shape, places = np.ones(3, np.int64), np.zeros((1, 3), np.int32)
+    cell, out = np.zeros(1, np.int32), np.zeros(1, np.int64)
+    pass_through(places, places, shape, 1, cell)
+    tally(cell, shape, places, cell, places, 1, 1, out)
+    nearest_facing(cell, shape, places, places, places, places, 1, 0, out)
 
 
 def warm_fold() -> None:
