@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 
 from dagmap.aligning import align
-from dagmap.config import Config, TransactionConfig
+from dagmap.config import Config, PlacingConfig, TransactionConfig
 from dagmap.model import Cycle
 from dagmap.registration import Working
 from dagmap.sim.scene import MotionConfig, Scene, SceneConfig, SensorConfig
@@ -138,7 +138,11 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="every run, as one JSON object")
     chosen = parser.parse_args()
     config = msgspec.structs.replace(
-        Config(transaction=TransactionConfig(proof_of_work_bits=0)), start_pose=None
+        Config(
+            transaction=TransactionConfig(proof_of_work_bits=0),
+            placing=PlacingConfig(surfaces=True),
+        ),
+        start_pose=None,
     )
     warm()
     runs = []

@@ -23,7 +23,10 @@ from scene import QUICK, agent, pose
 
 Points = np.ndarray
 UNKNOWN = msgspec.structs.replace(
-    QUICK, start_pose=None, graph=GraphConfig(), placing=PlacingConfig(units_per_tick=3000)
+    QUICK,
+    start_pose=None,
+    graph=GraphConfig(),
+    placing=PlacingConfig(units_per_tick=3000, surfaces=True),
 )
 HERE, THERE = (FrameId(bytes([n]) * 8) for n in (1, 2))
 
@@ -292,15 +295,18 @@ def test_an_agent_that_starts_again_keeps_its_link(
     assert again.digest() == ann.digest() and again.unplaced == {}
 
 
-def test_shape_can_be_left_out(met: tuple[dict[str, Agent], dict[str, Points]]) -> None:
+def test_shape_is_left_out_unless_it_is_wanted(
+    met: tuple[dict[str, Agent], dict[str, Points]],
+) -> None:
     ann, bob = met[0]["ann"], met[0]["bob"]
-    quiet = msgspec.structs.replace(UNKNOWN, placing=PlacingConfig(surfaces=False))
+    quiet = msgspec.structs.replace(UNKNOWN, placing=PlacingConfig())
     robot = agent("cid", quiet)
     for tx in (*ann.ledger, *bob.ledger):
         robot.take(tx.data)
     robot.observe(walk(furnished(1), None, 7, 1)[0], 0.0)
     robot.tick(1.0)
     assert not robot.searching and robot.placing._surfaces.shapes == {}
+    assert all("surfaces = true in [placing]" in why for why in robot.unplaced.values())
 
 
 def test_a_tick_does_its_share_of_the_search(

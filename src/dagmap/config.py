@@ -232,8 +232,9 @@ class PlacingConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
     keyframe_distance: float = 0.3  # m between keyframes that look the same way
     keyframe_turn: float = 15.0  # degrees between keyframes of one place
     inliers: int = 30  # points that must agree before a link is published
-    surfaces: bool = True  # whether frames without descriptors are placed by their shape; a fleet
-    # among rooms that are alike to the centimetre, each robot in one of them, is not to
+    # Whether frames without descriptors are placed by their shape. Rooms that are alike to the
+    # centimetre, each seen by one robot only, would be laid on each other: so it is to be wanted.
+    surfaces: bool = False
     # Work of a tick: comparing two keyframes of 200 points is two units, half a ms together. So a
     # tick stays under 10 ms, a fifth of what a SLAM can spare; a piece of work ends later at most.
     units_per_tick: int = 24

@@ -23,6 +23,7 @@ from .payload import CERTAIN, Described, Link
 from .relating import Likeness, Relation
 from .surfaces import Surfaces
 
+_BY_SHAPE = " (a sensor without descriptors: surfaces = true in [placing])"
 DESCRIBED = 2  # keyframes with descriptors: with fewer of them a frame is placed by its surfaces
 
 
@@ -71,9 +72,10 @@ class Placing:
 
     def why(self, consensus: Consensus) -> dict[FrameId, str]:
         """Of each frame outside of this robot's components: why it is not placed there."""
-        reasons = dict.fromkeys(
-            sorted(self._strange(consensus, consensus.frames)), "too little came yet to compare"
-        )
+        little = "too little came yet to compare"
+        if not self._config.surfaces:
+            little = "too few described points came yet" + _BY_SHAPE
+        reasons = dict.fromkeys(sorted(self._strange(consensus, consensus.frames)), little)
         for (_, target), relation in sorted(self._relations.items()):
             if target in reasons and relation.there and relation.reason:
                 reasons[target] = relation.reason
