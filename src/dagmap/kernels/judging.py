@@ -104,7 +104,8 @@ def judge(
     node. seed, origin, first, entries: see `matching.Nodes`. part: (A, 4) zeros, and zeros again
     afterwards; touched: (A,).
     out: (N, 7) is written: hits, witnesses, against, distance, passed, ended, hidden.
-    denied: (E,) is written: by entry, whether more of the author's own passes than ends are there.
+    denied: (E,) is written: by entry, whether more of the author's own passes than ends are there;
+    who has no row in `part` has no rays.
     """
     top, buckets, brick = bricks.top, bricks.buckets, bricks.brick
     bx = by = bz = _NEVER  # the brick of the node before, most often this one's too
@@ -125,8 +126,10 @@ def judge(
         mine = int(first[node])
         while mine >= 0:
             author = int(entries[mine, 0])
-            free, ends = int(part[author, PASSED]), int(part[author, ENDED])
-            denied[mine] = min(int(say[2]), free) > min(int(say[2]), ends)
+            denied[mine] = author < part.shape[0] and (
+                min(int(say[2]), int(part[author, PASSED]))
+                > min(int(say[2]), int(part[author, ENDED]))
+            )
             h += min(int(say[0]), int(entries[mine, 1]))
             w += 1
             mine = int(entries[mine, 3])
