@@ -313,7 +313,7 @@ def test_a_tick_does_its_share_of_the_search(
     met: tuple[dict[str, Agent], dict[str, Points]],
 ) -> None:
     ann = met[0]["ann"]
-    slow = msgspec.structs.replace(UNKNOWN, placing=PlacingConfig(units_per_tick=24))
+    slow = msgspec.structs.replace(UNKNOWN, placing=PlacingConfig(surfaces=True))
     data = [tx.data for tx in ann.ledger if not tx.payload.links]
     robot = Agent.restore(ann.identity, slow, data)
     robot.settle()

@@ -125,7 +125,7 @@ def boundless_n_c(patch: pytest.MonkeyPatch) -> None:
     """The controller raises N_c beyond what others accept."""
 
     def cut(self: Controller, over: float, done: object, affordable: bool) -> None:
-        self.n_c *= 2
+        self.n_c = 1000
 
     patch.setattr(Controller, "_cut", cut)
     # the graph would refuse it

@@ -188,14 +188,14 @@ class TestPicture:
         snapshot = take(two[0])
         world = two[0].map
         everything = Picture(snapshot, tuple(State), ["ada", "bob"])
-        rejected = Picture(snapshot, (State.REJECTED,), ["ada", "bob"])
-        assert len(everything) == len(world) and len(rejected) == world.count(State.REJECTED) > 0
-        assert rejected.colors("state").shape == rejected.positions.shape
-        assert len(set(map(tuple, rejected.colors("state").tolist()))) == 1
+        confirmed = Picture(snapshot, (State.CONFIRMED,), ["ada", "bob"])
+        assert len(everything) == len(world) and len(confirmed) == world.count(State.CONFIRMED) > 0
+        assert confirmed.colors("state").shape == confirmed.positions.shape
+        assert len(set(map(tuple, confirmed.colors("state").tolist()))) == 1
         eye = world.positions.mean(axis=0) + np.array([50.0, 0.0, 0.0])
         for row in range(3):
-            node = rejected.pick(eye, rejected.positions[row] - eye)
-            assert node is not None and world.states[node] == State.REJECTED
+            node = confirmed.pick(eye, confirmed.positions[row] - eye)
+            assert node is not None and world.states[node] == State.CONFIRMED
 
     def test_the_camera_stands_above_and_sees_all(self, two: list[Agent]) -> None:
         stand = Stand(take(two[0]))
@@ -488,7 +488,7 @@ class TestLive:
                 assert until(told, "the remark")
 
     def test_an_endpoint_that_is_none(self) -> None:
-        with pytest.raises(DagmapError, match="endpoints such as"):
+        with pytest.raises(DagmapError, match="an endpoint such as"):
             LiveFleet("nonsense")
 
     def test_a_robot_of_a_closed_fleet_is_not_doubled(self, tmp_path: Path) -> None:
