@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dagmap import ConfigError
-from dagmap.io.settings import Settings, load_settings
+from dagmap.io.settings import Settings, is_endpoint, load_settings
 from dagmap.io.transport import session_config
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "fleet"
@@ -112,6 +112,25 @@ class TestMistakes:
         with pytest.raises(ConfigError, match=message.replace("$", r"\$")) as error:
             load(tmp_path, text)
         assert str(error.value).startswith(f"{tmp_path}/robot7.toml: ")
+
+
+@pytest.mark.parametrize(
+    ("text", "good"),
+    [
+        ("tcp/192.168.1.7:7447", True),
+        ("tls/[::]:0", True),
+        ("tcp/robot1.local:7447#iface=wlan0", True),
+        ("unixsock-stream//tmp/robot", True),
+        ("7447", False),
+        ("tcp/", False),
+        ("tcp/robot1", False),
+        ("tcp/7447", False),
+        ("tcp/robot1:", False),
+        ("udp/robot1:70000", False),
+    ],
+)
+def test_an_endpoint_has_a_protocol_an_address_and_a_port(text: str, good: bool) -> None:
+    assert is_endpoint(text) == good
 
 
 class TestSession:

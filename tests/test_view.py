@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -88,10 +89,35 @@ class TestThinning:
         assert near.sum() > 50 and set(rows) == set(np.flatnonzero(near))
         assert set(Thinning(self.points).near(centre, 1.5, 20)) < set(rows)
 
+    def test_a_map_of_many_kilometres_is_thinned_alike(self) -> None:
+        far = Thinning(5000.0 * self.points)
+        octants = (self.points[far.everywhere(300)] > 0) @ [1, 2, 4]
+        assert np.bincount(octants, minlength=8).min() > 15
+        assert len(far.everywhere(4999)) == 4999
+
     def test_equal_points_and_none(self) -> None:
         assert len(Thinning(np.ones((9, 3))).everywhere(9)) == 9
         nothing = Thinning(np.zeros((0, 3)))
         assert len(nothing.everywhere(5)) == len(nothing.near(np.zeros(3), 1.0, 5)) == 0
+
+
+_FIRST = """
+import sys
+from pathlib import Path
+from dagmap.cli.view import ViewCommand
+from dagmap.io.view.run import Run
+from dagmap.io.view.window import Window
+with Window(Run(Path(sys.argv[1])), "127.0.0.1", 0) as window:
+    window.show_first()
+    print(window.controls.counts.content, "numba" in sys.modules)
+"""
+
+
+def test_a_first_picture_does_not_wait_for_compiled_kernels(run: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _FIRST, str(run)], capture_output=True, text=True, check=True
+    )
+    assert "nodes:" in done.stdout and done.stdout.rstrip().endswith("False")
 
 
 class TestColours:
@@ -410,6 +436,7 @@ class TestCommand:
                 {"live": "foo"},
                 r"^--live foo: an endpoint such as \"tcp/192.168.1.7:7447\" is wanted",
             ),
+            ({"live": "tcp/foo"}, "^--live tcp/foo: an endpoint such as"),
         ):
             with pytest.raises(DagmapError, match=said):
                 self.command(**changes).run()

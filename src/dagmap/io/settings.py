@@ -110,10 +110,19 @@ class NetworkConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
         )
         for name in ("listen", "connect"):
             ends: tuple[str, ...] = getattr(self, name)
-            named = all("/" in end.strip("/") for end in ends)
+            named = all(map(is_endpoint, ends))
             self._require(named, name, 'endpoints such as "tcp/192.168.1.7:7447" are wanted')
             secure = self.tls is None or all(end.startswith("tls/") for end in ends)
             self._require(secure, name, "with [network.tls] every endpoint begins with tls/")
+
+
+def is_endpoint(text: str) -> bool:
+    """Whether it names a way in or out: protocol/address, and the port where there are ports."""
+    protocol, _, address = text.partition("/")
+    if protocol not in ("tcp", "udp", "tls", "quic", "ws"):
+        return bool(protocol and address)
+    host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
+    return bool(host) and port.isascii() and port.isdigit() and int(port) < 1 << 16
 
 
 class StoreConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):

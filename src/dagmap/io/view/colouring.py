@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...model import Floats, Int64s, State, Uint8s
-from ...worldmap import WorldMap
-from ..export import MapLike
+from ..export import MapLike, PlyMap
 from ..panels import rgb, robot_colors, visible
+
+if TYPE_CHECKING:
+    from ...worldmap import WorldMap
 
 STATE, ROBOT, RATIO, COLOUR = COLOURINGS = ("state", "robot", "hit ratio", "colour seen")
 SEVERAL = "#8a2fb8"  # seen by more than one robot: the figures' colour of merged nodes
@@ -43,14 +46,14 @@ def legend(colouring: str, names: Sequence[str]) -> list[tuple[str, str]]:
     return []
 
 
-def owners_of(world: MapLike, names: Sequence[str]) -> Int64s:
+def owners_of(world: WorldMap | PlyMap, names: Sequence[str]) -> Int64s:
     """(N,) which of the robots alone has seen a node; -1: several have, -2: nobody knows."""
     owners = np.full(len(world.positions), -2, np.int64)
-    if isinstance(world, WorldMap):
+    if not isinstance(world, PlyMap):
         for i, name in enumerate(names):
             nodes = world.nodes_of(name)
             owners[nodes[nodes >= 0]] = i
-    owners[np.asarray(world.witnesses) > 1] = -1
+    owners[np.asarray(world.witnesses, np.int64) > 1] = -1
     return owners
 
 

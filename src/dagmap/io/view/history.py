@@ -6,18 +6,17 @@ when the fold came by; so a slider can be dragged both ways.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from ...agent import Agent
 from ...config import Config
 from ...identity import Identity
 from ...transaction import id_of
+from .source import Progress
 
 MARKS = 16  # folded states that are kept, evenly over the ledger
 MOST_BYTES = 512 << 20  # of them all
 _STEP = 64  # transactions that are folded between two words on the progress
-
-Progress = Callable[[float], None]  # of a share from 0 to 1
 
 
 def silent(share: float) -> None:

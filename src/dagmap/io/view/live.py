@@ -28,11 +28,11 @@ from ..closing import Closing
 from ..log import Log
 from ..queues import Inbox, Question
 from ..runtime import Runtime
-from ..settings import AgentConfig, NetworkConfig, Settings, load_settings
+from ..settings import AgentConfig, NetworkConfig, Settings, is_endpoint, load_settings
 from ..transport import Transport
-from .history import History, Progress
+from .history import History
 from .snapshot import Snapshot, name_of, take
-from .source import Standing
+from .source import Progress, Standing
 
 _PATIENCE = 60.0  # s for a snapshot: a participant that copies a large map works on it meanwhile
 _PEERS = 256  # senders are not authenticated, so their number must be bounded
@@ -197,7 +197,7 @@ def _settings(endpoint: str, file: Path | None) -> Settings:
         settings = load_settings(file)
     config = settings.config
     network = config.network
-    if "/" not in endpoint.strip("/") or (network.tls and not endpoint.startswith("tls/")):
+    if not is_endpoint(endpoint) or (network.tls and not endpoint.startswith("tls/")):
         example = "tls/robot1.local:7447" if network.tls else "tcp/192.168.1.7:7447"
         raise DagmapError(
             f'--live {endpoint}: an endpoint such as "{example}" is wanted, one that a robot '

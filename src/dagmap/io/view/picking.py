@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ...config import FoldConfig
 from ...model import Floats, State
-from ...worldmap import Observation, WorldMap
+
+if TYPE_CHECKING:
+    from ...worldmap import Observation, WorldMap
 
 ANGLE = 0.012  # radians about the ray in which a click finds a point
 

@@ -5,20 +5,20 @@ from __future__ import annotations
 import secrets
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from ...agent import Agent
 from ...config import Config
 from ...identity import Identity
 from ...model import ConfigError, DagmapError, Rejected, StoreError
-from ...transaction import id_of
 from ..export import read_ply
 from ..store import Store
-from .history import History, Progress
 from .snapshot import Snapshot, take
-from .source import Standing
+from .source import Progress, Standing
+
+if TYPE_CHECKING:
+    from .history import History
 
 _STEP = 64  # transactions that are read between two words on the progress
 _FEATURES = 50_000  # that are folded between two
@@ -59,7 +59,7 @@ class Run:
         self._identity = Identity.from_seed(secrets.token_bytes(32))
         self._transactions = self._read(self.robot)
         self._latest: Snapshot | None = None
-        self._history = History(self.config, self._identity)
+        self._history: History | None = None
         self._refused = 0
 
     def first(self) -> Snapshot | None:
@@ -69,35 +69,23 @@ class Run:
 
     def latest(self, progress: Progress) -> Snapshot:
         if self._latest is None:
-            agent = Agent(self._identity, self.config)
-            for i, data in enumerate(self._transactions):
-                events = agent.take(data)
-                self._refused += any(isinstance(event, Rejected) for event in events)
-                if i % _STEP == 0:
-                    progress(0.5 * i / len(self._transactions))
-            folded = 0
-            while agent.consensus.pending:
-                folded += agent.consensus.advance(_FEATURES)[1]
-                progress(0.5 + 0.5 * folded / len(self._transactions))
-            self._latest = take(agent)
-            counted = agent.consensus.contributions()
-            self._history.follow([each.transaction.data for each in counted])
+            self._latest, self._history = self._fold(progress)
         return self._latest
 
     @property
     def count(self) -> int:
-        return len(self._history)
+        return 0 if self._history is None else len(self._history)
 
     def at(self, count: int, progress: Progress) -> Snapshot:
         latest = self.latest(progress)
-        if count >= self.count:
+        if self._history is None or count >= len(self._history):
             return latest
         return take(self._history.agent_at(count, progress))
 
     def standings(self) -> Sequence[Standing]:
         """A robot that holds the same set of transactions holds the same map: that is looked at,
         not what `summary.json` says."""
-        mine = set(map(id_of, self._transactions))
+        mine = set(self._transactions)
         digest = "" if self._latest is None else self._latest.digest
         return [self._standing(robot, mine, digest) for robot in self._robots]
 
@@ -112,9 +100,27 @@ class Run:
     def close(self) -> None:
         """Nothing is held open."""
 
+    def _fold(self, progress: Progress) -> tuple[Snapshot, History]:
+        """The whole ledger, and how to walk through it."""
+        from ...agent import Agent  # these load compiled kernels: the first picture comes before
+        from .history import History
+
+        agent = Agent(self._identity, self.config)
+        for i, data in enumerate(self._transactions):
+            events = agent.take(data)
+            self._refused += any(isinstance(event, Rejected) for event in events)
+            if i % _STEP == 0:
+                progress(0.5 * i / len(self._transactions))
+        folded = 0
+        while agent.consensus.pending:
+            folded += agent.consensus.advance(_FEATURES)[1]
+            progress(0.5 + 0.5 * folded / len(self._transactions))
+        counted = [each.transaction.data for each in agent.consensus.contributions()]
+        return take(agent), History(self.config, self._identity, counted)
+
     def _standing(self, robot: _Robot, mine: set[bytes], digest: str) -> Standing:
         try:
-            theirs = mine if robot.name == self.robot else set(map(id_of, self._read(robot.name)))
+            theirs = mine if robot.name == self.robot else set(self._read(robot.name))
         except StoreError as error:
             return Standing(robot.name, robot.digest, None, str(error))
         if theirs != mine:

@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...agent import Agent
 from ...config import Config
-from ...contribution import Author
 from ...model import FLEET_FRAME, AuthorId, Floats, FrameId, Int32s, Int64s, pose_matrix
-from ...transaction import Transaction
-from ...worldmap import build_map
-from ..export import MapLike
+from ..export import PlyMap
+
+if TYPE_CHECKING:  # they load compiled kernels, which a first picture need not wait for
+    from ...agent import Agent
+    from ...contribution import Author
+    from ...transaction import Transaction
+    from ...worldmap import WorldMap
 
 MAX_POSES = 2000  # of one robot's path; of more, as many evenly
 
@@ -47,7 +50,7 @@ class Said:
 class Snapshot:
     """said: the transactions that count, in canonical order. paths: of robots in this map."""
 
-    world: MapLike
+    world: WorldMap | PlyMap
     said: Sequence[Said] = ()
     paths: Sequence[Path] = ()
     digest: str = ""
@@ -60,6 +63,8 @@ class Snapshot:
 
 def take(agent: Agent) -> Snapshot:
     """The agent as it stands. To be called in the thread that owns it."""
+    from ...worldmap import build_map
+
     digest, authors = agent.digest().hex(), agent.consensus.authors
     origin = _largest(agent)
     world = agent.map

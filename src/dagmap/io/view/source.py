@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 from ...config import Config
-from .history import Progress
 from .snapshot import Snapshot
+
+Progress = Callable[[float], None]  # of a share from 0 to 1
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from ...model import DagmapError, Floats
-from ...worldmap import WorldMap
 from ..closing import Closing
+from ..export import PlyMap
 from ..panels import rgb, robot_colors
 from . import words
 from .controls import Controls
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     import viser
 
 POINTS = 400_000  # drawn of a map at most, unless somebody asks for more
-_MOVING = 30_000  # points all over the map: what a browser without a graphics card can turn
-_RESTING = 100_000  # that it can draw when nothing moves, about the place it looks at
+_MOVING = 10_000  # points all over the map: what a browser without a graphics card can turn
+_RESTING = 40_000  # that it can draw when nothing moves, about the place it looks at
 _EDGES = 20_000
 _TICK = 0.05  # s between two looks at what is wanted
 _REST = 0.3  # s without a movement of the camera, after which its surroundings are drawn
@@ -87,12 +87,16 @@ class Window(Closing):
 
     def run(self) -> None:
         """Draw, and go on drawing what is new or wanted."""
+        self.show_first()
+        while not self._stopped.wait(_TICK):
+            self.step()
+
+    def show_first(self) -> None:
+        """What can be shown before the ledger is read."""
         first = self._source.first()
         if first is not None:
             self._show(first)
             self._headstart.shown(time.monotonic())
-        while not self._stopped.wait(_TICK):
-            self.step()
 
     def stop(self) -> None:
         """End `run`. From any thread."""
@@ -306,7 +310,7 @@ class Window(Closing):
         place = world.positions[node]
         radius = 0.0015 * self.controls.size.value
         scene.add_icosphere("/picked", radius, _MARK, position=tuple(place))
-        if isinstance(world, WorldMap):
+        if not isinstance(world, PlyMap):
             fold = self._source.config.fold
             self.controls.node.content = words.node(world, node, snapshot.said, fold)
         else:

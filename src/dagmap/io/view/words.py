@@ -5,14 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from html import escape
+from typing import TYPE_CHECKING
 
 from ...config import FoldConfig
 from ...model import State
-from ...worldmap import WorldMap
 from .colouring import legend
 from .picking import reason, sightings
 from .snapshot import Said, Snapshot
 from .source import Standing
+
+if TYPE_CHECKING:
+    from ...worldmap import WorldMap
 
 _NEWEST = 6  # transactions that are listed
 _SEEN = 8  # robots of one node that are listed
