@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from dagmap import Config, Cycle, GraphConfig, Overloaded
-from dagmap.config import IssuanceConfig, OverheadConfig, TransactionConfig
+from dagmap.config import IssuanceConfig, LedgerConfig, OverheadConfig, TransactionConfig
 from dagmap.sim.fleet import Fleet
 from dagmap.sim.network import Link, Network
 from dagmap.sim.robot import Costs, Happening, Robot, Timed
@@ -19,6 +19,7 @@ PLAIN = Config(
     transaction=TransactionConfig(proof_of_work_bits=0),
     graph=GraphConfig(reference_pitch=0.25, max_parent_distance=0.75),
     issuance=IssuanceConfig(repeats=0),
+    ledger=LedgerConfig(fold_period=60.0),  # nobody looks at the map: what is watched is the way
 )
 TICK = 0.2
 

@@ -12,7 +12,7 @@ What is accepted is decided by the transaction and by what it refers to, never b
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -83,6 +83,7 @@ class Ledger:
         self._waiting = OrderedDict()
         self._waited_for: dict[TransactionId, list[TransactionId]] = {}
         self._waiting_at: dict[tuple[AuthorId, int], TransactionId] = {}
+        self._lowest: dict[AuthorId, int] | None = None  # of these, by author; None: not known
         self._waiting_size = 0
         self._tips: set[TransactionId] = set()
         self._overfull: set[TransactionId] = set()  # kept, but never folded
@@ -169,12 +170,13 @@ class Ledger:
                 lacking.extend(id_ for id_ in before if not self.holds(id_))
         return tuple(dict.fromkeys(lacking))
 
-    def waiting_from(self) -> dict[AuthorId, int]:
+    def waiting_from(self) -> Mapping[AuthorId, int]:
         """The lowest sequence number that waits, by author."""
-        lowest: dict[AuthorId, int] = {}
-        for author, number in self._waiting_at:
-            lowest[author] = min(number, lowest.get(author, number))
-        return lowest
+        if self._lowest is None:
+            self._lowest = {}
+            for author, number in self._waiting_at:
+                self._lowest[author] = min(number, self._lowest.get(author, number))
+        return self._lowest
 
     def add(self, transaction: Transaction, again: bool = False) -> Outcome:
         """Take a transaction that is valid in itself, and whatever waited for it."""
@@ -308,6 +310,7 @@ class Ledger:
         """Keep aside; the oldest leave where the room is full (they will be asked for again)."""
         self._waiting[tx.id] = (tx, set(missing))
         self._waiting_at.setdefault((tx.author, tx.sequence), tx.id)
+        self._lowest = None
         self._waiting_size += len(tx.data)
         for id_ in missing:
             self._waited_for.setdefault(id_, []).append(tx.id)
@@ -323,6 +326,7 @@ class Ledger:
         self._waiting_size -= len(tx.data)
         if self._waiting_at.get((tx.author, tx.sequence)) == id_:
             del self._waiting_at[tx.author, tx.sequence]
+            self._lowest = None
         for lacking in missing:
             waiters = self._waited_for[lacking]
             waiters.remove(id_)

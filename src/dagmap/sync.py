@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import heapq
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import filterfalse
 from typing import NamedTuple
@@ -300,7 +300,7 @@ class Sync:
         longest = self._config.retry_period
         return longest if peer.delay is None else min(longest, max(0.3, 8 * peer.delay))
 
-    def _promises(self, head: Head, waiting: dict[AuthorId, int]) -> bool:
+    def _promises(self, head: Head, waiting: Mapping[AuthorId, int]) -> bool:
         return self._proves(head) or self._wanted(head, waiting) is not None
 
     def _proves(self, head: Head) -> bool:
@@ -310,7 +310,7 @@ class Sync:
         cut = self._ledger.chain(head.author).cut
         return cut is None or head.cut < cut
 
-    def _wanted(self, head: Head, waiting: dict[AuthorId, int]) -> tuple[int, int] | None:
+    def _wanted(self, head: Head, waiting: Mapping[AuthorId, int]) -> tuple[int, int] | None:
         """The range of an author's chain that a head promises and that is lacking here."""
         chain = self._ledger.chain(head.author)
         mine = len(chain.main)
