@@ -154,9 +154,21 @@ class RayEvidence:
         arrays of (N, A), and (E,) which entries are denied; see `kernels.judging.judge`."""
         out, denied = np.zeros((len(seed), 7), np.int32), np.zeros(len(entries), np.bool_)
         part, touched = np.zeros((self._authors, 4), np.int32), np.zeros(self._authors, np.int32)
-        held, cell, limit = self._bricks, self._cell, self._limit
+        solid = np.zeros((int(self._bricks.top[bricks.BRICKS]), 64), np.uint8)
         judging.judge(
-            held, cell, limit, say, seed, origin, first, entries, part, touched, out, denied
+            self._bricks,
+            self._cell,
+            self._limit,
+            say,
+            seed,
+            origin,
+            first,
+            entries,
+            part,
+            touched,
+            solid,
+            out,
+            denied,
         )
         return out, denied
 
