@@ -11,7 +11,7 @@ from ..agent import Agent
 from ..consensus import Consensus
 from ..graph import AdjacencyDag
 from ..identity import signature_holds
-from ..model import AuthorId, Int64s, Issued, MapChanged, State, TransactionId
+from ..model import AuthorId, Bools, Int64s, Issued, MapChanged, State, TransactionId
 from ..transaction import Transaction, signed_part
 from .fleet import Fleet
 from .robot import Happening, Observed, Robot
@@ -199,17 +199,21 @@ class Invariants:
         """
         parents, taken = graph.parents(), graph.parents_taken()
         ids, here = np.arange(len(graph)), graph.alive() | graph.issued()
-        self._require(bool((parents < ids[:, None]).all()), "the graph has a cycle", "")
+        self._each(np.all(parents < ids[:, None], axis=1), "the graph has a cycle")
         counted = np.bincount(parents[parents >= 0], minlength=len(graph))
         children = graph.children_count()
-        self._require(bool((counted == children)[here].all()), "children are miscounted", "")
-        self._require(
-            bool((children <= largest).all()), "too many children", f"{children.max(initial=0)}"
-        )
-        terminals = np.flatnonzero(graph.alive() & (counted < n_c))
-        self._require(np.array_equal(graph.terminals(), terminals), "E is wrong", "")
-        wanted = self._validity(graph, parents, taken)
-        self._require(np.array_equal(graph.validity()[here], wanted[here]), "validity", "")
+        self._each((counted == children) | ~here, "children are miscounted")
+        self._each(children <= largest, "too many children")
+        found, wanted = graph.terminals(), np.flatnonzero(graph.alive() & (counted < n_c))
+        if not np.array_equal(found, wanted):
+            self._require(False, "E is wrong", f"of {np.setxor1d(found, wanted)[:5].tolist()}")
+        sums = self._validity(graph, parents, taken)
+        self._each((graph.validity() == sums) | ~here, "validity")
+
+    def _each(self, good: Bools, name: str) -> None:
+        """It must hold of every feature; else the first that breaks it is named."""
+        if not good.all():
+            self._require(False, name, f"feature {int(good.argmin())} of {len(good)}")
 
     @staticmethod
     def _validity(graph: AdjacencyDag, parents: Int64s, taken: Int64s) -> Int64s:
