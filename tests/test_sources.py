@@ -25,8 +25,8 @@ from dagmap.model import (
     CycleError,
     OutputError,
     RecordingError,
-    quantise_cycle,
 )
+from dagmap.quantising import quantise_cycle
 
 ROOT = Path(__file__).parents[1]
 OFFICE = ROOT / "examples" / "office"

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from ...model import ConfigError, Cycle, CycleError, RecordingError, quantise_cycle
+from ...model import ConfigError, Cycle, CycleError, RecordingError
+from ...quantising import quantise_cycle
 
 _S = TypeVar("_S")
 _T = TypeVar("_T")

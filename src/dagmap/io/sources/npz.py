@@ -18,7 +18,8 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ...model import DESCRIPTOR, Cycle, CycleError, Int64s, RecordingError, quantise_cycle
+from ...model import DESCRIPTOR, Cycle, CycleError, Int64s, RecordingError
+from ...quantising import quantise_cycle
 from ..export import atomic_write
 from ..npy import BROKEN, read_array, read_header, read_layout, read_members
 from ._source import Options, Skips, checked, kept
