@@ -172,7 +172,7 @@ def test_what_is_whole_of_the_texts_is_kept(drive: Path, sequence: Path) -> None
     def stamps(path: Path) -> list[float]:
         source = open_source(path, Options(keep_going=True))
         found = list(source)
-        assert len(source) == len(found) and source.skips.count  # type: ignore[attr-defined]
+        assert len(source) == len(found) and source.skips.count
         assert all(np.allclose(c.pose, pose_at(c.stamp), atol=1e-6) for c in found)
         return [round(cycle.stamp, 3) for cycle in found]
 
@@ -246,7 +246,7 @@ def test_bad_clouds_are_named_or_left_out(
         list(open_source(tmp_path))
     source = open_source(tmp_path, Options(keep_going=True))
     assert len(list(source)) == 1
-    assert len(source.skips.told) == 1  # type: ignore[attr-defined]
+    assert len(source.skips.told) == 1
 
 
 def test_a_nan_that_signals_is_a_point_left_out(tmp_path: Path) -> None:

@@ -380,7 +380,7 @@ def test_damaged_pictures_are_left_out_where_that_is_asked_for(folder: Path) -> 
         list(open_source(folder))
     source = open_source(folder, Options(keep_going=True))
     assert [cycle.stamp for cycle in source] == [1.0, 2.0]
-    assert len(source.skips.told) == 1  # type: ignore[attr-defined]
+    assert len(source.skips.told) == 1
 
 
 def test_what_is_no_recording(tmp_path: Path) -> None:
@@ -590,7 +590,7 @@ def test_the_other_cycles_of_a_stream_are_kept(tmp_path: Path, what: str) -> Non
     source = open_source(path, Options(keep_going=True))
     for _ in range(2):
         assert [cycle.stamp for cycle in source] == [1.0 if what not in ("back",) else 2.0]
-    assert source.skips.count == 1  # type: ignore[attr-defined]
+    assert source.skips.count == 1
 
 
 @pytest.mark.parametrize("packed", [True, False])

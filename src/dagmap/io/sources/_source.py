@@ -20,6 +20,8 @@ class Source(Protocol):
     """A recording. It can be iterated again, and gives the same cycles."""
 
     name: str  # the folder's name or the file's stem: what the robot is called
+    notes: tuple[str, ...]  # where its poses come from, and what is only assumed of them
+    skips: Skips
 
     def __len__(self) -> int:
         """Cycles that iterating gives."""
@@ -73,6 +75,17 @@ class Description:
     cycles: int | None = None
     problem: str | None = None
     notes: tuple[str, ...] = ()
+
+
+def described(
+    kind: str, items: tuple[Item, ...], opened: Callable[[], Source], *more: str
+) -> Description:
+    """What there is, with what opening it tells. more: notes that concern every one of its kind."""
+    try:
+        source = opened()
+    except RecordingError as error:
+        return Description(kind, items, None, str(error))
+    return Description(kind, items, len(source), None, (*source.notes, *more))
 
 
 @dataclass(slots=True)

@@ -25,6 +25,7 @@ _PLACES = (".", "sparse/0", "sparse")
 _PARTS, _SUFFIXES = ("points3D", "images"), (".bin", ".txt")
 _NO_POINT = np.uint64(2**64 - 1)
 _MOST_NAME = 4096  # bytes
+_SCALE = "lengths are the model's own: scale it to metres first (model_aligner)"
 _T = TypeVar("_T")
 
 
@@ -68,8 +69,7 @@ def describe(path: Path, options: Options) -> Description:
         Item("images", "poses", len(model), "cycles"),
         Item("points3D", "3D points", model.count, "points"),
     )
-    notes = ("lengths are the model's own: scale it to metres first (model_aligner)",)
-    return Description("COLMAP model", items, len(model), None, notes)
+    return Description("COLMAP model", items, len(model), None, model.notes)
 
 
 class ColmapModel:
@@ -78,6 +78,7 @@ class ColmapModel:
     def __init__(self, path: Path, options: Options) -> None:
         self.name, self._options = folder_name(path), options
         self.skips = Skips(options.keep_going)
+        self.notes: tuple[str, ...] = (_SCALE,)
         found = _model(path)
         if found is None:
             raise RecordingError(f"{path}: {_half(path)}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from ._lists import Row, Stamped, read_rows, stamped_files
 from ._odometry import PictureOdometry
 from ._poses import Trajectory, matrix, nearest
 from ._rgbd import FrontEnd, decode, import_cv2
-from ._source import Description, Item, Options, Skips, checked, folder_name, kept
+from ._source import Description, Item, Options, Skips, checked, described, folder_name, kept
 from ._stereo import Lens, Stereo, load_lens
 from ._trajectory import doubts, read_tum
 
@@ -53,11 +54,7 @@ def describe(path: Path, options: Options) -> Description:
     mav = _mav(path) or path
     counts = {name: _count(mav / name / "data") for name in ("cam0", "cam1")}
     items = tuple(Item(name, "pictures", n, "stereo") for name, n in counts.items())
-    try:
-        source = open(path, options)
-    except RecordingError as error:
-        return Description(UNDERSTANDS, items, None, str(error))
-    return Description(UNDERSTANDS, items, len(source), None, source.notes)
+    return described(UNDERSTANDS, items, partial(open, path, options))
 
 
 class EurocFolder:

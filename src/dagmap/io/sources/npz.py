@@ -69,6 +69,7 @@ class CycleStream:
     def __init__(self, path: Path, options: Options) -> None:
         self.name, self._path = path.stem, path
         self.skips = Skips(options.keep_going)
+        self.notes: tuple[str, ...] = ()
         try:
             self._arrays = _load(path)
         except BROKEN as error:  # RecordingError is none of these

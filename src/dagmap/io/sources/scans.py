@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -22,7 +23,17 @@ from ._kiss import KissIcp
 from ._lists import Row, read_rows, rising
 from ._pcd import read_pcd
 from ._poses import inverse
-from ._source import Description, Item, Options, Skips, checked, folder_name, kept, read_bytes
+from ._source import (
+    Description,
+    Item,
+    Options,
+    Skips,
+    checked,
+    described,
+    folder_name,
+    kept,
+    read_bytes,
+)
 from ._trajectory import read_tum
 
 UNDERSTANDS = "a folder of clouds (KITTI's .bin, .pcd or .ply; poses.txt)"
@@ -51,11 +62,7 @@ def describe(path: Path, options: Options) -> Description:
     items = (
         Item(str(clouds[0].parent.relative_to(path)), clouds[0].suffix, len(clouds), "clouds"),
     )
-    try:
-        source = open(path, options)
-    except RecordingError as error:
-        return Description(UNDERSTANDS, items, None, str(error))
-    return Description(UNDERSTANDS, items, len(source), None, source.notes)
+    return described(UNDERSTANDS, items, partial(open, path, options))
 
 
 class ScanFolder:
