@@ -118,10 +118,12 @@ def kinds_of(normals: Floats, axes: Floats) -> Int64s:
 def survey(points: Floats, origins: Floats, groups: Int64s, fine: float) -> Working[Surfels | None]:
     """Surfels of points (N, 3) that were seen from `origins` (N, 3) in keyframes `groups` (N,).
 
-    fine: mm, the smallest cell. None where too little is flat.
+    fine: mm, the smallest cell. None where too little is flat, or most lies too far from the rest.
     """
     cell, origin = fine, np.median(points, axis=0)
     near = np.abs(points - origin).max(axis=1) < _WIDE * fine
+    if not near.any():
+        return None
     points, origins, groups = points[near] - origin, origins[near] - origin, groups[near]
     while True:
         order, keys, ends = _sorted(points, cell)

@@ -1,0 +1,77 @@
+"""What robots have published, for a look at its shape: bounded, whatever somebody publishes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from chains import CONFIG, Author, anchor, bundle
+from dagmap import clouds
+from dagmap.clouds import Cloud
+from dagmap.ledger import Ledger
+from dagmap.payload import Bundle, Payload
+from dagmap.surfels import survey
+
+
+def read(author: Author) -> Cloud:
+    """The cloud of all that an author has signed."""
+    ledger, cloud = Ledger(CONFIG), Cloud()
+    for tx in author.chain:
+        assert ledger.add(tx).accepted
+    while cloud.read_on(ledger.chain(author.identity.author), CONFIG) >= 0:
+        pass
+    return cloud
+
+
+def scattered(base: int, count: int) -> Bundle:
+    """Each feature in a cycle of its own."""
+    one, starts = bundle(base, count), np.arange(count + 1, dtype=np.int64)
+    cycles = np.arange(base, base + count, dtype=np.int64)
+    return Bundle(
+        base, one.position, one.parents, one.color, starts, cycles, np.zeros(count, np.uint8)
+    )
+
+
+def test_of_points_in_ever_new_cycles_a_share_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clouds, "MOST_POINTS", 50)
+    author = Author("ann")
+    for base in range(0, 1000, 10):
+        anchors = tuple(anchor(cycle) for cycle in range(base, base + 10))
+        author.make(payload=Payload(anchors=anchors, bundle=scattered(base, 10)))
+    points, _, _ = read(author).gather(0, 1.0)
+    assert 25 <= len(points) <= 50
+    assert np.ptp(points[:, 0]) > 1500, "from the whole way"
+
+
+def test_what_is_withdrawn_twice_costs_nothing_more() -> None:
+    author = Author("ann")
+    author.make(features=6)
+    for numbers in ([1, 4], [4], [1, 4, 5]):
+        author.make(payload=Payload(retracted=np.array(numbers, np.int64)))
+    cloud = read(author)
+    points, origins, groups = cloud.gather(0, 1.0)
+    assert points.tolist() == bundle(0, 6).position[[0, 2, 3]].tolist()
+    assert len(origins) == len(groups) == 3
+    author.make(features=3)
+    assert len(read(author).gather(0, 1.0)[0]) == 6
+
+
+@pytest.mark.parametrize("odd", [0, 1])
+def test_points_at_the_ends_of_the_world_have_no_shape(odd: int) -> None:
+    """Whoever says so must not stop the robot that looks at it."""
+    rng = np.random.default_rng(0)
+    away = np.array([5e8, 5e8, 5e8])
+    points = np.concatenate([rng.uniform(0, 900, (300 + odd, 3)) + away, -away + np.eye(300, 3)])
+    assert (
+        finished(survey(points, np.zeros_like(points), np.zeros(len(points), int), 100.0)) is None
+    )
+
+
+def finished(work: Any) -> Any:
+    while True:
+        try:
+            next(work)
+        except StopIteration as done:
+            return done.value
