@@ -10,6 +10,7 @@ import pytest
 from chains import CONFIG, Author, anchor, bundle
 from dagmap import clouds
 from dagmap.clouds import Cloud
+from dagmap.kernels.voxels import LONGEST, SHIFT, pass_through
 from dagmap.ledger import Ledger
 from dagmap.payload import Bundle, Payload
 from dagmap.surfels import survey
@@ -67,6 +68,18 @@ def test_points_at_the_ends_of_the_world_have_no_shape(odd: int) -> None:
     assert (
         finished(survey(points, np.zeros_like(points), np.zeros(len(points), int), 100.0)) is None
     )
+
+
+def test_of_a_ray_from_far_away_its_end_is_looked_at() -> None:
+    """Sensors stand where their robots say: a ray costs no more than a LiDAR's can."""
+    shape, passes = np.array([3 * LONGEST, 1, 1], np.int64), np.zeros(3 * LONGEST, np.int32)
+    end = np.array([[3 * LONGEST - 1, 0, 0]], np.int32) << SHIFT
+    for away in (3 * LONGEST, 1_000_000):
+        passes[:] = 0
+        pass_through(end - np.array([[away << SHIFT, 0, 0]], np.int32), end, shape, 2, passes)
+        crossed = np.flatnonzero(passes)
+        assert crossed.tolist() == list(range(crossed[0], 3 * LONGEST - 3))
+        assert 0 <= LONGEST - len(crossed) <= 1
 
 
 def finished(work: Any) -> Any:
