@@ -126,7 +126,7 @@ def test_what_is_learned_suits_sparse_sensors(tmp_path: Path) -> None:
         assert row["defaults"]["f_10_cm"] > row["dense"]["f_10_cm"] + 0.05
         assert row["defaults"]["true_rejected"] < 0.1 < row["dense"]["true_rejected"]
         assert row["best_of_grid"]["f_10_cm"] == max(each["f_10_cm"] for each in row["grid"])
-        assert [each["doubt"] for each in row["grid"]] == ["learned", 36]
+        assert [each["doubt"] for each in row["grid"]] == ["learned", 20, 36]
     assert "f_5_cm" in result["cases"][0]["tuned"]
 
 
