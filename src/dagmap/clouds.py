@@ -99,8 +99,8 @@ class Cloud:
                 self.sessions[known.session] = self.sessions.get(known.session, 0) + high - low
         while self._kept > MOST_POINTS:
             self._every *= 2
-            before, self._segments, self._kept = self._segments, [], 0
-            for segment in before:
+            segments, self._segments, self._kept = self._segments, [], 0
+            for segment in segments:
                 self._keep(segment)
 
     def _keep(self, segment: _Segment) -> None:
