@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from chains import CONFIG, Author, anchor, bundle
-from dagmap import clouds
+from dagmap import clouds, surfels
 from dagmap.clouds import Cloud
 from dagmap.kernels.voxels import LONGEST, SHIFT, pass_through
 from dagmap.ledger import Ledger
@@ -80,6 +80,22 @@ def test_of_a_ray_from_far_away_its_end_is_looked_at() -> None:
         crossed = np.flatnonzero(passes)
         assert crossed.tolist() == list(range(crossed[0], 3 * LONGEST - 3))
         assert 0 <= LONGEST - len(crossed) <= 1
+
+
+def test_cells_are_spread_to_their_neighbours_slab_by_slab(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    grid = (rng.random((7, 23, 5)) < 0.05).astype(np.int32) << rng.integers(0, 3, (7, 23, 5))
+    grid = grid.astype(np.int32)
+    around = np.pad(grid, 1)
+    wanted = np.zeros_like(grid)
+    for x, y, z in np.ndindex(3, 3, 3):
+        wanted |= around[x : x + 7, y : y + 23, z : z + 5]
+    for size in (1, 50, 1 << 18):
+        monkeypatch.setattr(surfels, "_UNIT_CELLS", size)
+        spread = grid.copy()
+        pieces = sum(1 for _ in surfels._dilate(spread))
+        assert (spread == wanted).all() and pieces >= 3
+        assert pieces > 30 or size > 1
 
 
 def finished(work: Any) -> Any:
