@@ -298,9 +298,9 @@ def _fill(surfels: Surfels, points: Floats, origins: Floats, smooth: Bools) -> W
     for _ in _dilate(surfels.cells.reshape(shape)):
         yield 4
     for at in range(0, len(passes), _UNIT_CELLS):
-        part = slice(at, at + _UNIT_CELLS)
-        proven = (passes[part] >= _PASSES) & (passes[part] > 2 * ended[part])
-        surfels.cells[part][proven & (surfels.cells[part] == 0)] = FREE
+        slab = slice(at, at + _UNIT_CELLS)
+        proven = (passes[slab] >= _PASSES) & (passes[slab] > 2 * ended[slab])
+        surfels.cells[slab][proven & (surfels.cells[slab] == 0)] = FREE
         yield 8
 
 
