@@ -38,10 +38,10 @@ from .model import (
     TransactionId,
     Waiting,
     pose_matrix,
-    quantise_cycle,
 )
 from .observing import Observing
 from .placing import Placing
+from .quantising import quantise_cycle
 from .shaping import Urgency
 from .steering import Steering
 from .sync import Sync
