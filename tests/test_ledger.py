@@ -63,10 +63,17 @@ def test_a_transaction_waits_for_what_it_refers_to() -> None:
     first, second = a.make(), a.make()
     answer = b.make(second)
     ledger = Ledger(CONFIG)
+    third = a.make()
+    assert ledger.waiting_from() == {}
     assert ledger.add(answer).missing == (second.id,)
+    assert ledger.add(third).missing == (second.id,)
+    assert ledger.waiting_from() == {answer.author: 0, first.author: 2}
     assert ledger.add(second).missing == (first.id,)
     assert ledger.missing() == (first.id,)
-    assert [tx.id for tx in ledger.add(first).accepted] == [first.id, second.id, answer.id]
+    assert ledger.waiting_from() == {answer.author: 0, first.author: 1}
+    accepted = [tx.id for tx in ledger.add(first).accepted]
+    assert accepted[:2] == [first.id, second.id] and set(accepted[2:]) == {answer.id, third.id}
+    assert ledger.waiting_from() == {}
 
 
 def test_waiting_room_is_bounded_and_what_left_can_come_again() -> None:
