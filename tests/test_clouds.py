@@ -10,9 +10,11 @@ import pytest
 from chains import CONFIG, Author, anchor, bundle
 from dagmap import clouds, surfels
 from dagmap.clouds import Cloud
+from dagmap.consensus import Consensus
 from dagmap.kernels.voxels import LONGEST, SHIFT, pass_through
 from dagmap.ledger import Ledger
 from dagmap.payload import Bundle, Payload
+from dagmap.surfaces import Surfaces
 from dagmap.surfels import survey
 
 
@@ -104,3 +106,20 @@ def finished(work: Any) -> Any:
             next(work)
         except StopIteration as done:
             return done.value
+
+
+def test_poses_without_points_cost_their_share_of_a_step() -> None:
+    """Or whoever sends nothing else would have all of them read in one tick."""
+    ann, ben = Author("ann"), Author("ben")
+    consensus, ledger = Consensus(CONFIG), Ledger(CONFIG)
+    for author, length in ((ann, 1), (ben, 300)):
+        for cycle in range(length):
+            tx = author.make(payload=Payload(anchors=(anchor(cycle),)))
+            assert ledger.add(tx).accepted
+            consensus.add(tx)
+    consensus.advance()
+    me = Surfaces(CONFIG, ann.identity.author)
+    steps = 1
+    while me.step(ledger, consensus, (), 24) >= 24:
+        steps += 1
+    assert steps > 300 // 24
