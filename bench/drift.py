@@ -17,10 +17,10 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -31,16 +31,18 @@ from dagmap.sim.fleet import Fleet
 from dagmap.sim.odometry import Odometry
 from dagmap.sim.odometry import pose_matrix as level
 from dagmap.sim.scene import MotionConfig, Scene, SceneConfig, SensorConfig
+from office import load
 from placing import random_pose
 
 Floats = npt.NDArray[np.float64]
 NAMES = ("right", "drifting")
-POINTS, APART = 150, 0.12  # seen in a cycle, at most; m between places that are known again
+POINTS, APART = 400, 0.08  # seen in a cycle, at most; m between places that are known again
 WRONG = 0.1  # of the points lie at 0.3 to 1.6 times their distance
 Robots = dict[str, list[Cycle]]
+Given = tuple[Robots, Robots, Floats, Floats]
 
 
-def building(seed: int, drift: float, seconds: float) -> tuple[Robots, Robots, Floats, Floats]:
+def building(seed: int, drift: float, seconds: float) -> Given:
     """What robots hand in, where they truly were, all surfaces, and what of these was seen."""
     motion = MotionConfig(drift=drift, drift_yaw=drift / 10, loop_closures=False)
     sensor = SensorConfig(points=400, tracked=0.0, outliers=0.0, noise=0.0)
@@ -85,12 +87,11 @@ def visible(
     return np.asarray(rows[depth[0] >= far[rows] - 0.02][:POINTS], np.int64)
 
 
-def office(folder: Path, seed: int, drift: float) -> tuple[Robots, Robots, Floats, Floats]:
+def office(
+    folder: Path, cache: Path, seed: int, drift: float
+) -> tuple[Robots, Robots, Floats, Floats]:
     """The same of a recorded walk."""
-    from office import load
-
-    walk = load(folder, Path("out/quality"))
-    frames = sorted((f for robot in walk.robots for f in robot), key=lambda f: f.stamp)
+    walk = load(folder, cache)
     frames = [frame for robot in walk.robots for frame in robot]
     cycles = [replace(f.cycle(), stamp=0.3 * i) for i, f in enumerate(frames)]
     true = {name: cycles[index::2] for index, name in enumerate(NAMES)}
@@ -103,7 +104,7 @@ def drifted(cycles: list[Cycle], drift: float, rng: np.random.Generator) -> list
     """Each step off by a share of its length, in a direction that changes slowly."""
     bias, turn = rng.normal(size=3), rng.normal(size=3)
     out = [cycles[0]]
-    for before, after in zip(cycles, cycles[1:], strict=False):
+    for before, after in pairwise(cycles):
         step = np.linalg.inv(np.asarray(before.pose)) @ np.asarray(after.pose)
         length = float(np.linalg.norm(step[:3, 3]))
         step[:3, 3] += drift * length * bias
@@ -168,15 +169,16 @@ def run(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, help="the walk: a TUM RGB-D folder")
+    parser.add_argument("--cache", type=Path, default=Path("out/quality"), help="for ORB points")
     parser.add_argument("--drift", type=float, default=0.02, help="m per m, standard deviation")
     parser.add_argument("--seconds", type=float, default=100.0)
     parser.add_argument("--seeds", type=int, default=1)
     chosen = parser.parse_args()
-    scenes: dict[str, Callable[[int, float], tuple[Robots, Robots, Floats, Floats]]] = {
+    scenes: dict[str, Callable[[int, float], Given]] = {
         "building": lambda seed, drift: building(seed, drift, chosen.seconds)
     }
     if chosen.data:
-        scenes["office"] = lambda seed, drift: office(chosen.data, seed, drift)
+        scenes["office"] = lambda seed, drift: office(chosen.data, chosen.cache, seed, drift)
     for name, make in scenes.items():
         for seed in range(chosen.seeds):
             for drift in (0.0, chosen.drift):

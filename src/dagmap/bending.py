@@ -40,7 +40,7 @@ LOOKS = 4  # that are borne out, at least
 STEP = 0.7  # of what is lacking: robots that bend towards each other meet, and do not swing
 NOISE = 0.25  # of the tolerance: how far off a described point is, and
 WORTH = 6  # points of a look count, for all of them share an error
-NEWS = 0.25  # of the tolerance: bends that change by less are not published
+NEWS = 0.25  # of the tolerance: what fewer keyframes than `LOOKS` are off by is no news
 TRUSTED = 3  # times the drift that is allowed: what is off by more is no drift
 GROWN = 1.1  # keyframes must have grown by so much before it is looked again
 
@@ -246,7 +246,7 @@ def bent(path: Path, looks: list[Look], config: PlacingConfig) -> Floats | None:
     seen = sorted({look.own for look in looks})
     turns, shifts = (np.linalg.norm(part[seen], axis=1) for part in np.hsplit(change, 2))
     news = path.views.depth * turns + shifts
-    if news.max() <= NEWS * tolerance:
+    if np.sort(news)[-LOOKS:][0] <= NEWS * tolerance:
         return None
     steps = [small(c, place) for c, place in zip(change, places, strict=True)]
     motions = np.array(steps) @ path.motions
