@@ -51,11 +51,12 @@ class Placing:
         if not strange and not self._keyframes and not self._surfaces.shapes:
             return [], False  # everybody shares one frame
         self._take_in(ledger, consensus)
+        # first, since drift that is left would look like another way to place the frame
+        share = self._config.units_per_tick // 2
+        self.spent += self._bending.step(self._keyframes, consensus, self._moves, share)
         links = self._search(consensus)
         if self._config.surfaces:
             links += self._look_at_surfaces(ledger, consensus)
-        left = self._config.units_per_tick - self.spent
-        self.spent += self._bending.step(self._keyframes, consensus, self._moves, left)
         measured = any(r.published or r.answer for r in self._relations.values())
         return links, bool(strange) or measured
 
