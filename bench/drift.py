@@ -173,16 +173,17 @@ def main() -> None:
     parser.add_argument("--drift", type=float, default=0.02, help="m per m, standard deviation")
     parser.add_argument("--seconds", type=float, default=100.0)
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--scenes", nargs="+", choices=("building", "office"))
     chosen = parser.parse_args()
     scenes: dict[str, Callable[[int, float], Given]] = {
         "building": lambda seed, drift: building(seed, drift, chosen.seconds)
     }
     if chosen.data:
         scenes["office"] = lambda seed, drift: office(chosen.data, chosen.cache, seed, drift)
-    for name, make in scenes.items():
+    for name in chosen.scenes or scenes:
         for seed in range(chosen.seeds):
             for drift in (0.0, chosen.drift):
-                given = make(seed, drift)
+                given = scenes[name](seed, drift)
                 for rate, both in ((0.0, False), (chosen.drift, False), (chosen.drift, True)):
                     row = {"scene": name, "seed": seed, "drift": drift, "bent": rate, "both": both}
                     print(json.dumps(row | run(*given, rate, both, seed)), flush=True)
