@@ -246,7 +246,7 @@ def bent(path: Path, looks: list[Look], config: PlacingConfig) -> Floats | None:
     seen = sorted({look.own for look in looks})
     turns, shifts = (np.linalg.norm(part[seen], axis=1) for part in np.hsplit(change, 2))
     news = path.views.depth * turns + shifts
-    if np.sort(news)[-LOOKS:][0] <= NEWS * tolerance:
+    if (news > NEWS * tolerance).sum() < LOOKS:
         return None
     steps = [small(c, place) for c, place in zip(change, places, strict=True)]
     motions = np.array(steps) @ path.motions
