@@ -42,7 +42,7 @@ def displaced(scan: Scan, share: float, rng: np.random.Generator) -> tuple[Scan,
 
 
 def judged(seen: list[Scan], config: FoldConfig) -> tuple[Bools, Floats]:
-    """Of each point, robot by robot, whether its node is rejected; (N, 3) m nodes that are not."""
+    """Of each point, scan by scan, whether its node is rejected; (N, 3) m nodes that are not."""
     fold, rays = DefaultFold(config), RayEvidence(config.cell_mm, config.max_ray_mm)
     for scan in seen:
         block = scan.block
@@ -52,7 +52,10 @@ def judged(seen: list[Scan], config: FoldConfig) -> tuple[Bools, Floats]:
     verdict, columns = fold.evaluate(rays), fold.columns()
     rejected = verdict.states == State.REJECTED
     places = columns.seed + columns.offset / columns.count[:, None]
-    nodes = np.concatenate([fold.feature_nodes(robot) for robot in range(ROBOTS)])
+    of = [fold.feature_nodes(robot) for robot in range(ROBOTS)]
+    nodes = np.concatenate(
+        [of[b.author][b.base : b.base + len(b.xyz)] for b in (scan.block for scan in seen)]
+    )
     return rejected[nodes], places[~rejected] / 1000.0
 
 
@@ -63,8 +66,7 @@ def rows(cycles: float) -> Iterator[dict[str, object]]:
         for share in (0.0, 0.1, 0.4):
             rng = np.random.default_rng(1)
             pairs = [displaced(scan, share, rng) for scan in clean]
-            of_robot = [np.concatenate([w for _, w in pairs[r::ROBOTS]]) for r in range(ROBOTS)]
-            wrong = np.concatenate(of_robot)
+            wrong = np.concatenate([chosen for _, chosen in pairs])
             for doubt in (None, DENSE):
                 config = FoldConfig(delta=delta, cell=cell, max_ray=max_ray, doubt=doubt)
                 rejected, kept = judged([scan for scan, _ in pairs], config)

@@ -226,8 +226,7 @@ class Agent:
         return self._map
 
     def frame(self) -> Floats | None:
-        """(4, 4) pose of the robot's SLAM frame in the fleet frame, as its drift is now; None while
-        not placed."""
+        """(4, 4) m, the SLAM frame in the fleet frame, as it drifts by now; None: not placed."""
         self._catch_up()
         placed = self.consensus.frames.get(FrameId(*self._frame))
         return None if placed is None else pose_matrix(placed[1]) @ self.observing.drift.now
