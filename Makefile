@@ -9,7 +9,7 @@
 #   make figures      the paper's figures and what was measured beside them, in out/figures; minutes
 #   make sweep        thousands of simulated missions with faults and liars, SEEDS=2000 for more, and
 #                     a real robot killed 200 times, KILLS=2000 for more
-#   make reliability  all figures and plots of docs/reliability.md; hours
+#   make reliability  all figures and plots of docs/reliability.md; hours; PARTS="sweep loss" for some
 #   make fuzz         fuzz all that reads foreign bytes, 10^6 executions (RUNS=...); Linux, Python 3.11 on
 #   make docs         build the site into out/site
 #   make lock         renew requirements/*.txt after a change of dependencies in pyproject.toml
@@ -71,7 +71,7 @@ sweep: $(TEST)/.package
 	DAGMAP_KILLS=$(KILLS) $(TEST)/bin/python -m pytest -q tests/test_fleet_crash.py::TestKill
 
 reliability: $(TEST)/.package
-	@$(TEST)/bin/python bench/reliability.py
+	@$(TEST)/bin/python bench/reliability.py $(PARTS)
 
 RUNS ?= 1000000
 fuzz: $(TEST)/.fuzz

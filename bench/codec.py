@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from dagmap import AdjacencyDag, Config
 from dagmap.io.sources import open_source
 from dagmap.kernels.codec import decode_features, encode_features, morton_order
-from dagmap.model import quantise_cycle
+from dagmap.quantising import quantise_cycle
 from scenes import FRAME, surface
 
 OFFICE = Path(__file__).parents[1] / "examples" / "office"

@@ -1,6 +1,11 @@
 """The figures of docs/reliability.md: `make reliability` (hours), or for a look at them
 `python bench/reliability.py --seeds 60 --runs 2 --seconds 30 --out out/figures` (minutes).
 
+All figures go to reliability.json beside the page, with how each part of them was made; the page is
+written from that alone. `python bench/reliability.py hundred busy` measures these parts anew and
+takes the others from there, `... text` only writes the page again. What is interrupted goes on
+where it was, as long as the code is the same.
+
 Not part of `dagmap bench`: it measures the promises, not the machine.
 """
 
@@ -11,6 +16,7 @@ import json
 import os
 import re
 import sys
+import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
@@ -20,9 +26,11 @@ from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
+from rich.console import Console
 from rich.progress import Progress
 
 from dagmap.config import Config, FoldConfig, GraphConfig, SyncConfig, TransactionConfig
+from dagmap.model import Cycle
 from dagmap.sim.fleet import Crash
 from dagmap.sim.mission import Mission, Report
 from dagmap.sim.network import Link, Partition
@@ -32,16 +40,26 @@ from dagmap.sim.sensor import SensorConfig
 from dagmap.sim.sweep import sweep
 from dagmap.sim.truth import Lies, judge_lies
 from dagmap.sim.walk import MotionConfig
-from reliability_text import write
+from keeping import kept
+from reliability_text import PAGE, write
 
 ROOT = Path(__file__).parents[1]
 LONG = ("hundred", "hour")  # scenarios that are runs of their own, not part of the sweep
 LOSSES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 KINDS = ("forger", "eraser", "splitter", "wrong-frame", "outsider", "early-outsider")
-SLICE = 25  # seeds of each scenario between two times that a sweep is kept
+SLICE = 125  # seeds of each scenario between two times that a sweep is kept
 FLEET = 8  # robots in the runs with loss and in those with liars
 A, B = TypeVar("A"), TypeVar("B")
 Tell = Callable[[str, float], None]  # (what is measured, share done)
+PARTS = {  # and which options each depends on
+    "busy": (),
+    "hundred": ("seconds",),
+    "hour": ("seconds",),
+    "divergence": (),
+    "loss": ("runs",),
+    "liars": ("runs",),
+    "sweep": ("seeds",),
+}
 
 SMALL = Scenario(
     robots=FLEET,
@@ -107,10 +125,14 @@ BUSY = changed(
 )
 
 
-def timed(scenario: Scenario, tell: Callable[[float], None]) -> dict[str, Any]:
+def timed(
+    scenario: Scenario, tell: Callable[[float], None], *recordings: dict[str, list[Cycle]]
+) -> dict[str, Any]:
     """One run, alone in this process."""
-    report = Mission(scenario, 1).run(lambda now: tell(min(1.0, now / scenario.seconds)))
-    return {"mission_s": scenario.seconds, **msgspec.to_builtins(report)}
+    mission, began = Mission(scenario, 1, *recordings), time.process_time()
+    report = mission.run(lambda now: tell(min(1.0, now / scenario.seconds)))
+    took = {"mission_s": scenario.seconds, "processor_s": time.process_time() - began}
+    return took | msgspec.to_builtins(report)
 
 
 def busy(tell: Callable[[float], None]) -> dict[str, Any]:
@@ -118,8 +140,13 @@ def busy(tell: Callable[[float], None]) -> dict[str, Any]:
     b = BUSY
     scene = Scene(b.scene, b.sensor, b.motion, b.robots, 1)
     cycles = {name: list(scene.robot(i).cycles(b.seconds)) for i, name in enumerate(b.names)}
-    report = Mission(b, 1, cycles).run(lambda now: tell(min(1.0, now / b.seconds)))
-    return msgspec.to_builtins(report)
+    return without_divergence(timed(b, tell, cycles))
+
+
+def without_divergence(run: dict[str, Any]) -> dict[str, Any]:
+    """Only the largest share that one robot ever lacked."""
+    shares = [share for _, share in run.pop("divergence")]
+    return run | {"apart_most": max(shares, default=0.0)}
 
 
 def fly(item: tuple[Scenario, int]) -> Report:
@@ -159,6 +186,8 @@ def swept(options: argparse.Namespace, tell: Callable[[float], None]) -> dict[st
     scenarios = [load_scenario(path) for path in paths]
     each, failure = -(-options.seeds // len(paths)), None
 
+    spent = [0.0, 0.0]
+
     def of(seeds: range) -> str | None:
         before, total = seeds.start * len(paths), each * len(paths)
         found = sweep(scenarios, seeds, options.jobs, lambda done: tell((before + done) / total))
@@ -168,9 +197,15 @@ def swept(options: argparse.Namespace, tell: Callable[[float], None]) -> dict[st
 
     for first in range(0, each, SLICE):
         seeds = range(first, min(first + SLICE, each))
-        failure = failure or kept(options, f"sweep_{first}", partial(of, seeds))
+        path, asked = options.kept / f"sweep_{first}.json", {"seeds": options.seeds}
+        part = kept(path, asked, partial(of, seeds))
+        spent = [a + b for a, b in zip(spent, part["made"]["spent"], strict=True)]
         tell(seeds.stop / each)
+        failure = part["figures"]
+        if failure is not None:
+            break
     return {
+        "spent": spent,
         "scenarios": [path.stem for path in paths],
         "seeds_each": each,
         "runs": each * len(paths),
@@ -184,7 +219,7 @@ def long_run(name: str, seconds: float | None, tell: Callable[[float], None]) ->
     if seconds is not None:
         parts = tuple(msgspec.structs.replace(p, end=seconds) for p in scenario.partitions)
         scenario = changed(scenario, seconds=seconds, partitions=parts)
-    return timed(scenario, tell)
+    return without_divergence(timed(scenario, tell))
 
 
 def lossy(
@@ -262,14 +297,17 @@ def fuzzed() -> int | None:
     return int(found[1].replace(",", "")) if found else None
 
 
-def measure(options: argparse.Namespace, tell: Tell) -> dict[str, Any]:
-    """All figures. What is timed runs alone; the rest side by side."""
+def measure(options: argparse.Namespace, tell: Tell, before: dict[str, Any]) -> dict[str, Any]:
+    """All parts. What is timed runs alone; the rest side by side.
+
+    before: the parts that the page was written from last.
+    """
 
     def about(what: str) -> Callable[[float], None]:
         return lambda share: tell(what, share)
 
     jobs, runs = options.jobs, options.runs
-    parts: dict[str, Callable[[], Any]] = {
+    work: dict[str, Callable[[], Any]] = {
         "busy": lambda: busy(about("messages a second")),
         "hundred": lambda: long_run("hundred", options.seconds, about("a hundred robots")),
         "hour": lambda: long_run("hour", options.seconds, about("an hour apart")),
@@ -278,40 +316,52 @@ def measure(options: argparse.Namespace, tell: Tell) -> dict[str, Any]:
         "liars": lambda: lying(max(1, runs // 10), jobs, about("liars")),
         "sweep": lambda: swept(options, about("sweep")),
     }
-    figures = {name: kept(options, name, part) for name, part in parts.items()}
-    return figures | {"fuzz_executions": fuzzed()}
+    return {
+        name: kept(options.kept / f"{name}.json", _asked(options, name), part)
+        if name in options.part
+        else before[name]
+        for name, part in work.items()
+    }
 
 
-def kept(options: argparse.Namespace, name: str, part: Callable[[], Any]) -> Any:
-    """What a part gave, from the file of an interrupted run with the same options where it may."""
-    asked = {"seeds": options.seeds, "runs": options.runs, "seconds": options.seconds}
-    path = options.parts / f"{name}.json"
-    if path.exists():
-        held = json.loads(path.read_text())
-        if held["asked"] == asked:
-            return held["figures"]
-    figures = part()
-    options.parts.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"asked": asked, "figures": figures}))
-    return json.loads(path.read_text())["figures"]
+def _asked(options: argparse.Namespace, name: str) -> dict[str, Any]:
+    return {option: getattr(options, option) for option in PARTS[name]}
+
+
+def asked_for() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description="Write docs/reliability.md and its plots.")
+    names = f"what to measure: {', '.join(PARTS)}; or text, to write the page only (default: all)"
+    parser.add_argument("part", nargs="*", help=names)
+    parser.add_argument("--seeds", type=int, default=10_000, help="runs of the sweep, in all")
+    parser.add_argument("--runs", type=int, default=50, help="seeds for each loss; a tenth: liars")
+    parser.add_argument("--seconds", type=float, help="shorten the long missions, for a look")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs", help="folder of the page")
+    kept_in = ROOT / "out" / "reliability"
+    parser.add_argument("--kept", type=Path, default=kept_in, help="what is done; goes on from it")
+    options = parser.parse_args()
+    unknown = set(options.part) - {*PARTS, "text"}
+    if unknown:
+        parser.error(f"{', '.join(sorted(unknown))}: unknown; {names}")
+    options.part = options.part or list(PARTS)
+    return options
+
+
+def parts_before(options: argparse.Namespace) -> dict[str, Any]:
+    """What the page in that folder was written from. Exits where a part is neither there nor
+    asked for."""
+    path = options.out / PAGE.with_suffix(".json")
+    before = json.loads(path.read_text())["parts"] if path.exists() else {}
+    missing = [name for name in PARTS if name not in before and name not in options.part]
+    if missing:
+        sys.exit(f"{path}: without {', '.join(missing)}; name these parts, too")
+    return before
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Write docs/reliability.md and its plots.")
-    parser.add_argument("--seeds", type=int, default=10_000, help="runs of the sweep, in all")
-    parser.add_argument("--runs", type=int, default=50, help="seeds for each loss")
-    parser.add_argument("--seconds", type=float, help="shorten the long missions, for a look")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
-    parser.add_argument("--out", type=Path, default=ROOT / "docs", help="folder of the document")
-    parser.add_argument(
-        "--parts",
-        type=Path,
-        default=ROOT / "out" / "reliability",
-        help="what is done is kept here; remove it to measure anew",
-    )
-    parser.add_argument("--json", action="store_true", help="print all figures as well")
-    options = parser.parse_args()
-    with Progress(console=_stderr()) as progress:
+    options = asked_for()
+    before = parts_before(options)
+    with Progress(console=Console(stderr=True)) as progress:
         tasks: dict[str, Any] = {}
 
         def tell(what: str, share: float) -> None:
@@ -319,31 +369,18 @@ def main() -> None:
                 tasks[what] = progress.add_task(what, total=1.0)
             progress.update(tasks[what], completed=share)
 
-        figures = measure(options, tell)
-    figures["options"] = {
-        "seeds": options.seeds,
-        "runs": options.runs,
-        "seconds": options.seconds,
-        "jobs": options.jobs,
-    }
-    figures["settings"] = {
+        parts = measure(options, tell, before)
+    settings = {
         "fleet": FLEET,
         "mission": SMALL.seconds,
         "points": SMALL.sensor.points,
         "period": SMALL.config.sync.announce_period,
         "trouble_loss": TROUBLED.link.loss,
     }
-    write(figures, options.out)
-    if options.json:
-        sys.stdout.write(json.dumps(figures) + "\n")
-    if figures["sweep"]["failure"] is not None:
-        sys.exit(f"a promise was broken: {figures['sweep']['failure']}")
-
-
-def _stderr() -> Any:
-    from rich.console import Console
-
-    return Console(stderr=True)
+    write({"parts": parts, "settings": settings, "fuzz_executions": fuzzed()}, options.out)
+    failure = parts["sweep"]["figures"]["failure"]
+    if failure is not None:
+        sys.exit(f"a promise was broken: {failure}")
 
 
 if __name__ == "__main__":

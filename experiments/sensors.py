@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import common
-from common import BLUE, GREEN, INK, RED, Row
+from common import BLUE, GREEN, INK, ORANGE, RED, Row
 from dagmap import Config, weighing
 from dagmap.io.panels import open_figure, save
 from dagmap.sim.sensor import SensorConfig
@@ -32,7 +32,7 @@ SENSORS = {
 }
 MIXED = "mixed"
 DELTAS = (0.02, 0.03, 0.05, 0.1, 0.2)
-DOUBTS = (None, weighing.MOST_DOUBT)  # learned, and that of a sensor that sees densely
+DOUBTS = (None, 20, weighing.MOST_DOUBT)  # learned, what suits few points, and many
 SHOWN = "f_10_cm"
 
 
@@ -84,7 +84,7 @@ def draw(path: Path, cases: list[Row]) -> None:
     with open_figure((2.9 * len(cases), 3.2), 1, len(cases)) as (figure, axes):
         for axis, row in zip(axes, cases, strict=True):
             doubts = dict.fromkeys(each["doubt"] for each in row["grid"])
-            for doubt, color in zip(doubts, (RED, BLUE), strict=False):
+            for doubt, color in zip(doubts, (RED, ORANGE, BLUE), strict=False):
                 mine = [each for each in row["grid"] if each["doubt"] == doubt]
                 x, y = [each["delta"] for each in mine], [each[SHOWN] for each in mine]
                 axis.plot(x, y, "o-", markersize=3, color=color, label=f"doubt {doubt}")

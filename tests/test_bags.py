@@ -276,7 +276,7 @@ def test_messages_that_cannot_be_used_are_named_or_left_out(tmp_path: Path) -> N
         open_source(path)
     source = open_source(path, Options(keep_going=True))
     assert [cycle.stamp for cycle in source] == pytest.approx([1.05, 1.45])
-    told = " ".join(source.skips.told)  # type: ignore[attr-defined]
+    told = " ".join(source.skips.told)
     assert "4000000000 x 1 points of 16 bytes are promised, 80 bytes are there" in told
     assert "no field x among none" in told
 

@@ -237,7 +237,7 @@ def test_damaged_pictures_are_left_out_where_that_is_asked_for(walk: Path) -> No
         list(open_source(walk))
     source = open_source(walk, Options(keep_going=True))
     assert len(list(source)) == COUNT - 2
-    told = source.skips.told  # type: ignore[attr-defined]
+    told = source.skips.told
     assert pictures[1].name in told[0] and "10 x 10 pixels, but sensor.yaml" in told[1]
 
 
@@ -252,7 +252,7 @@ def test_what_is_whole_of_the_lists_is_kept(walk: Path) -> None:
     assert len(str(caught.value)) < 1000
     source = open_source(walk, Options(keep_going=True))
     assert len(source) >= COUNT - 2
-    assert source.skips.count == 2  # type: ignore[attr-defined]
+    assert source.skips.count == 2
 
 
 def test_a_scene_without_texture_gives_empty_cycles(walk: Path) -> None:

@@ -126,7 +126,7 @@ def test_what_is_learned_suits_sparse_sensors(tmp_path: Path) -> None:
         assert row["defaults"]["f_10_cm"] > row["dense"]["f_10_cm"] + 0.05
         assert row["defaults"]["true_rejected"] < 0.1 < row["dense"]["true_rejected"]
         assert row["best_of_grid"]["f_10_cm"] == max(each["f_10_cm"] for each in row["grid"])
-        assert [each["doubt"] for each in row["grid"]] == ["learned", 36]
+        assert [each["doubt"] for each in row["grid"]] == ["learned", 20, 36]
     assert "f_5_cm" in result["cases"][0]["tuned"]
 
 
@@ -135,7 +135,7 @@ def test_where_features_are_few_the_defaults_hold(tmp_path: Path) -> None:
     rich, poor, barren = result["cases"]
     assert [row["points_a_cycle"] for row in result["cases"]] == [100, 15, 1]
     assert rich["defaults"]["f_10_cm"] > 0.9 and rich["tuned"]["f_10_cm"] > 0.9
-    assert poor["defaults"]["f_10_cm"] > 0.6 and poor["tuned"]["f_10_cm"] > 0.6
+    assert poor["defaults"]["f_10_cm"] > 0.8 and poor["tuned"]["f_10_cm"] > 0.8
     assert poor["V_th = 3"]["issued"] < rich["V_th = 3"]["issued"] < rich["defaults"]["issued"]
     assert "tuned" not in barren and "no cycle has two points" in barren["refused"]
     assert "tune refuses" in result["measured"][2]

@@ -122,7 +122,7 @@ def test_a_map_to_share(map_: Path, tmp_path: Path) -> None:
     [
         ("KeyFrameTrajectory.txt", "", "KeyFrameTrajectory.txt: no poses; a line `stamp x y z"),
         ("KeyFrameTrajectory.txt", "1 2 3\n", "KeyFrameTrajectory.txt, line 1: 8 finite numbers"),
-        ("KeyFrameTrajectory.txt", "1 0 0 0 0 0 0 9\n", "line 1: the quaternion is not of length"),
+        ("KeyFrameTrajectory.txt", "1 0 0 0 0 0 0 9\n", "line 1: a quaternion of length 9"),
         ("MapPoints.txt", "", "MapPoints.txt: no points; save the map"),
         ("MapPoints.txt", "1 2 3\n1 2\n", "MapPoints.txt, line 2: `x y z` is wanted.*--keep-going"),
         ("MapPoints.txt", "0 0 1e9\n", "MapPoints.txt: .*--keep-going"),
@@ -137,7 +137,9 @@ def test_bad_texts_are_named(map_: Path, file: str, text: str, said: str) -> Non
 def test_key_frames_that_are_damaged_are_left_out(map_: Path) -> None:
     file = map_ / "KeyFrameTrajectory.txt"
     file.write_text(file.read_text()[:-30])
-    with pytest.raises(RecordingError, match="line 4: 8 finite numbers are wanted.*--keep-going"):
+    with pytest.raises(
+        RecordingError, match="line 4: 8 finite numbers .* are wanted.*--keep-going"
+    ):
         open_source(map_)
     assert len(open_source(map_, Options(keep_going=True))) == COUNT - 1
 

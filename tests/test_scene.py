@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from dagmap import Cycle
-from dagmap.model import ConfigError, quantise_cycle
+from dagmap.model import ConfigError
+from dagmap.quantising import quantise_cycle
 from dagmap.sim.building import DOOR_HEIGHT, Building, inverse
 from dagmap.sim.odometry import CLOSURE_LENGTH, Odometry
 from dagmap.sim.scene import MotionConfig, Scene, SceneConfig, Seen, SensorConfig, Walker

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
+import numpy as np
 import pytest
 
 from dagmap import Agent
@@ -118,6 +119,28 @@ def test_recordings_are_found_beside_the_scenario(tmp_path: Path) -> None:
     assert report["transactions"] >= 8
     code, _, err = dagmap("simulate", tmp_path / "real.toml", "--seeds", 2)
     assert code == 2 and "recordings" in err
+
+
+def test_a_map_of_recordings_is_judged_by_a_reference(tmp_path: Path) -> None:
+    """The walls that `scene.cycles` shows are its truth; what lies half a metre off is not."""
+    for i, name in enumerate(("red.npz", "blue.npz")):
+        save_cycles(tmp_path / name, [replace(c, colors=None) for c in cycles(i, count=5)])
+    text = 'reference = "truth.npz"\n' + TEXT.replace("robots = 3", "robots = 2")
+    text = 'recordings = ["red.npz", "blue.npz"]\n' + text
+    (tmp_path / "real.toml").write_text(text)
+    scores = []
+    for aside in (0.0, 0.5):
+        wall = np.random.default_rng(7).uniform([2.0, -2.0, -1.0], [2.0, 2.0, 1.0], (300, 3))
+        np.savez(tmp_path / "truth.npz", points=wall + np.array([aside, 0.0, 0.0]))
+        code, out, _ = dagmap("simulate", tmp_path / "real.toml", "--json")
+        assert code == 0
+        scores.append(json.loads(out)["quality"])
+    near, far = scores
+    assert near["f_score"] > 0.5 and near["completeness"] < 0.3
+    assert far["f_score"] < 0.1 and far["accuracy"] > near["accuracy"] + 0.2
+    (tmp_path / "truth.npz").unlink()
+    code, _, err = dagmap("simulate", tmp_path / "real.toml")
+    assert code == 2 and "truth.npz" in err.replace("\n", "")
 
 
 def test_a_place_for_the_timeline_is_looked_at_before_the_work(small: Path) -> None:

@@ -467,6 +467,7 @@ BAD = {
     "late = [1.0, 1.0, 1.0]": "late",
     "recordings = ['a.npz']": "recordings",
     "recordings = ['a.npz', 'b.npz', 'c.npz']\n[link]\nreach = 5.0": "recordings",
+    "reference = 'truth.ply'": "reference.*recordings",
     "unknown = 1": "unknown",
     "[link]\nloss = 1.0": "Link: loss",
     "[link]\nloss = 'much'": "link.loss",

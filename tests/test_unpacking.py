@@ -26,7 +26,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
 from bags import Make, write_bag
-from dagmap.io.sources import Options, _unpacking, open_source
+from dagmap.io.sources import Options, _storage, _unpacking, open_source
 from dagmap.io.sources._storage import storage_files
 from dagmap.io.sources._unpacking import (
     MOST,
@@ -102,7 +102,7 @@ def mcap(path: Path, kind: str, claimed: int, size: int, indexed: bool) -> Path:
 OPEN = """
 import json, sys
 from pathlib import Path
-from dagmap.io.sources import Options, open_source
+from dagmap.io.sources import Options, _storage, open_source
 from dagmap.model import RecordingError
 import rosbags.highlevel, mcap.stream_reader, zstandard, lz4.frame, dagmap.io.sources._kiss
 
@@ -320,7 +320,7 @@ def test_a_packed_message_that_swells_is_left_out(tmp_path: Path) -> None:
         open_source(folder)
     source = open_source(folder, Options(keep_going=True))
     assert len(list(source)) == 4
-    assert source.skips.count == 1  # type: ignore[attr-defined]
+    assert source.skips.count == 1
 
 
 @pytest.mark.parametrize("mode", ["file", "message"])
@@ -360,4 +360,17 @@ def test_an_index_that_refers_to_itself_is_refused(tmp_path: Path) -> None:
     )
     (folder / "metadata.yaml").write_text(text)
     with pytest.raises(RecordingError, match="walk: .*repeats parts of itself by reference"):
+        open_source(folder)
+
+
+@pytest.mark.parametrize("mode", ["file", "message"])
+def test_an_index_that_names_a_file_again_and_again_is_refused(tmp_path: Path, mode: str) -> None:
+    folder = packed_as(tmp_path / "walk", mode)
+    index, name = folder / "metadata.yaml", next(iter(folder.glob("walk.*"))).name
+    again = "".join(f"\n  - ./{i * '/'}{name}" for i in range(1000))
+    index.write_text(index.read_text().replace(f"- {name}", f"- {name}{again}", 1))
+    with (
+        patch.object(_storage, "unpack_zstd_file", side_effect=AssertionError("unpacked")),
+        pytest.raises(RecordingError, match="metadata.yaml names a file twice"),
+    ):
         open_source(folder)

@@ -134,5 +134,6 @@ PARSERS = {
     "dagmap.io.sources.tum": (),
     "dagmap.io.sources._rgbd": ("import_cv2",),
     "dagmap.io.sources._source": ("Options.*",),
+    "dagmap.io.sources._lists": (),
 }
 TARGET = Target(run, mutate, seeds, PARSERS, max_len=16_384)

@@ -38,10 +38,10 @@ from .model import (
     TransactionId,
     Waiting,
     pose_matrix,
-    quantise_cycle,
 )
 from .observing import Observing
 from .placing import Placing
+from .quantising import quantise_cycle
 from .shaping import Urgency
 from .steering import Steering
 from .sync import Sync
@@ -316,8 +316,7 @@ class Agent:
     def _through_the_door(self, data: bytes, again: bool = False) -> list[Event]:
         """The one door: own and foreign transactions alike are judged, kept and folded."""
         try:
-            self._parsers.work(data, self.config)
-            id_ = id_of(data)
+            id_ = self._parsers.worked(data, self.config)
             if self.ledger.holds(id_):
                 return []
             if self.config.closed and not again:

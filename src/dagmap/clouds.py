@@ -11,13 +11,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .config import Config
+from .kernels.columns import grown
 from .keyframes import matrix_of
 from .ledger import Chain
-from .model import Floats, Int32s, Int64s
+from .model import Bools, Floats, Int32s, Int64s
 from .payload import Anchor
 from .transaction import Transaction
 
-MOST_POINTS = 60_000  # of one author that are kept; of more every second, fourth, ...
+MOST_POINTS = 60_000  # of one author that are kept; of more those with even numbers, then by four
 
 
 @dataclass(slots=True, eq=False)
@@ -39,7 +40,7 @@ class Cloud:
     anchors: dict[int, Anchor] = field(default_factory=dict)  # newest, by cycle
     sessions: dict[int, int] = field(default_factory=dict)  # points of each
     _segments: list[_Segment] = field(default_factory=list)
-    _retracted: list[Int64s] = field(default_factory=list)
+    _retracted: Bools = field(default_factory=lambda: np.zeros(0, np.bool_))  # by feature number
     _kept: int = 0
     _every: int = 1
 
@@ -57,7 +58,6 @@ class Cloud:
     def gather(self, session: int, apart: float) -> tuple[Floats, Floats, Int64s]:
         """Of a session: points (N, 3) mm, the places of the sensor (N, 3) mm, and the number of
         the keyframe (N,): a new one begins where the sensor has moved by `apart` mm."""
-        gone = np.sort(np.concatenate([np.zeros(0, np.int64), *self._retracted]))
         points, origins, groups = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0, np.int64)]
         last, group = np.full(3, np.inf), -1
         for segment in sorted(self._segments, key=lambda segment: segment.cycle):
@@ -68,9 +68,7 @@ class Cloud:
             place = pose[:3, 3]
             if not np.linalg.norm(place - last) < apart:
                 last, group = place, group + 1
-            at = np.minimum(np.searchsorted(gone, segment.numbers), max(0, len(gone) - 1))
-            left = segment.numbers != gone[at] if len(gone) else np.ones(len(at), np.bool_)
-            mine = segment.points[left] @ pose[:3, :3].T + place
+            mine = segment.points[~self._retracted[segment.numbers]] @ pose[:3, :3].T + place
             points.append(mine)
             origins.append(np.repeat(place[None], len(mine), axis=0))
             groups.append(np.full(len(mine), group))
@@ -81,30 +79,35 @@ class Cloud:
             before = self.anchors.get(anchor.cycle)
             self.moves += before is not None and not np.array_equal(before.pose, anchor.pose)
             self.anchors[anchor.cycle] = anchor
-        if len(tx.payload.retracted):
-            self._retracted.append(tx.payload.retracted)
+        self._retracted[tx.payload.retracted] = True  # of features that were issued, so known
         bundle = tx.decode_again(config).bundle if tx.features else None
         if bundle is None:
             return
         self.count += len(bundle.position)
+        self._retracted = grown(self._retracted, self.count, False)
         for cycle, low, high in zip(
             bundle.cycles.tolist(),
             bundle.starts[:-1].tolist(),
             bundle.starts[1:].tolist(),
             strict=True,
         ):
-            rows = np.arange(low, high, self._every)
-            segment = _Segment(cycle, bundle.base + rows, bundle.position[rows])
-            self._segments.append(segment)
-            self._kept += len(rows)
+            numbers = np.arange(bundle.base + low, bundle.base + high)
+            segment = _Segment(cycle, numbers, bundle.position[low:high])
+            self._keep(segment)
             known = self.anchors.get(cycle)
             if known is not None:
                 self.sessions[known.session] = self.sessions.get(known.session, 0) + high - low
-        if self._kept > MOST_POINTS:
-            self._thin()
+        while self._kept > MOST_POINTS:
+            self._every *= 2
+            segments, self._segments, self._kept = self._segments, [], 0
+            for segment in segments:
+                self._keep(segment)
 
-    def _thin(self) -> None:
-        self._every *= 2
-        for segment in self._segments:
-            segment.numbers, segment.points = segment.numbers[::2], segment.points[::2]
-        self._kept = sum(len(segment.points) for segment in self._segments)
+    def _keep(self, segment: _Segment) -> None:
+        """Its share of the points, if it has one."""
+        left = segment.numbers % self._every == 0
+        if left.any():
+            self._segments.append(
+                _Segment(segment.cycle, segment.numbers[left], segment.points[left])
+            )
+            self._kept += int(left.sum())

@@ -186,7 +186,8 @@ class Contribution:
         if self.fresh:
             self.fresh = False
             return self.xyz
-        bundle = self.transaction.decode_again(config).bundle
+        held = self.transaction.payload.bundle
+        bundle = held or self.transaction.decode_again(config).bundle
         return self.xyz if bundle is None else bundle.position
 
     def _home(self, cycle: int, frames: Frames) -> tuple[Anchor, Placement] | None:

@@ -121,12 +121,24 @@ class RayEvidence:
             return
         self._authors = max(self._authors, author + 1)
         origins, starts, xyz = plain(origins), plain(starts), plain(xyz)
-        alive, cell, limit = plain(alive), self._cell, self._limit
-        while not rays.list_cells(self._marks, cell, limit, origins, starts, xyz, alive):
-            steps = 3 * (limit // cell + 2)  # of the longest ray
-            rows, cells = len(self._marks.row) + steps // 8 + 4, len(self._marks.cell) + steps + 2
-            self._marks = _marks(rows, cells, self._marks.top)
-        self._add(author, sign)
+        alive, at = plain(alive), np.zeros(2, np.int64)
+        while True:
+            lacking = bricks.walk(
+                self._bricks,
+                self._marks,
+                self._cell,
+                self._limit,
+                author,
+                origins,
+                starts,
+                xyz,
+                alive,
+                sign,
+                at,
+            )
+            if lacking == bricks.DONE:
+                return
+            self._grow(lacking)
 
     def evidence(self, xyz: Int32s) -> tuple[Int32s, Int32s]:
         """Passes and ends, each (N, A), in the cell of each position (N, 3) mm."""
@@ -142,24 +154,37 @@ class RayEvidence:
         arrays of (N, A), and (E,) which entries are denied; see `kernels.judging.judge`."""
         out, denied = np.zeros((len(seed), 7), np.int32), np.zeros(len(entries), np.bool_)
         part, touched = np.zeros((self._authors, 4), np.int32), np.zeros(self._authors, np.int32)
-        held, cell, limit = self._bricks, self._cell, self._limit
+        solid = np.zeros((int(self._bricks.top[bricks.BRICKS]), 64), np.uint8)
         judging.judge(
-            held, cell, limit, say, seed, origin, first, entries, part, touched, out, denied
+            self._bricks,
+            self._cell,
+            self._limit,
+            say,
+            seed,
+            origin,
+            first,
+            entries,
+            part,
+            touched,
+            solid,
+            out,
+            denied,
         )
         return out, denied
 
-    def _add(self, author: int, sign: int) -> None:
-        """Add what is marked to the counters of an author."""
-        done, count, top = 0, int(self._marks.top[rays.CELLS]), self._bricks.top
-        while not bricks.find_entries(self._bricks, self._marks, author):
+    def _grow(self, lacking: int) -> None:
+        """Make the room that a walk lacks."""
+        if lacking == bricks.LISTING:
+            steps = 3 * (self._limit // self._cell + 2)  # of the longest ray
+            rows, cells = len(self._marks.row) + steps // 8 + 4, len(self._marks.cell) + steps + 2
+            self._marks = _marks(rows, cells, self._marks.top)
+        elif lacking == bricks.FINDING:
             self._grow_bricks()
-        while (done := bricks.add_cells(self._bricks, self._marks, sign, done)) < count:
-            small = with_room(self._bricks.small, 2 * int(top[bricks.SMALL]) + 1)
-            wide = with_room(self._bricks.wide, int(top[bricks.WIDE]) + 1)
-            word = small.view(np.int32)
-            self._bricks = self._bricks._replace(small=small, word=word, wide=wide)
-        if self._marks.top[rays.ZEROED]:
-            bricks.free_zeros(self._bricks, self._marks)
+        else:
+            held, top = self._bricks, self._bricks.top
+            small = with_room(held.small, 2 * int(top[bricks.SMALL]) + 1)
+            wide = with_room(held.wide, int(top[bricks.WIDE]) + 1)
+            self._bricks = held._replace(small=small, word=small.view(np.int32), wide=wide)
 
     def _grow_bricks(self) -> None:
         """Make room for a brick and an entry for each row of the marks."""

@@ -12,8 +12,9 @@ import numpy as np
 
 from .config import PlacingConfig
 from .kernels.geometry import compose
-from .model import QUATERNION_ONE, AuthorId, Floats, Int32s, QuantisedCycle, Uint8s, pose_matrix
+from .model import QUATERNION_ONE, AuthorId, Floats, Int32s, Uint8s, pose_matrix
 from .payload import Described
+from .quantising import QuantisedCycle
 from .registration import Views
 
 RECORD = 44  # bytes of a described point on the wire

@@ -25,6 +25,8 @@ from .model import AuthorId, Reason, TransactionId, Uint8s
 from .transaction import Transaction
 from .wire import Refusal
 
+_NONE_YET = np.zeros(0, np.uint8)
+
 
 @dataclass(slots=True)
 class Chain:
@@ -34,7 +36,8 @@ class Chain:
     cut: int | None = None
     revoked: int | None = None
     proof: tuple[Transaction, Transaction] | None = None
-    children: Uint8s = field(default_factory=lambda: np.zeros(0, np.uint8))  # of issued features
+    # of issued features; where it is to grow it is replaced
+    children: Uint8s = field(default_factory=lambda: _NONE_YET)
 
     @property
     def limit(self) -> int | None:

@@ -19,7 +19,7 @@ from .config import Config
 from .model import AuthorId, Reason, TransactionId
 from .transaction import MAX_SIZE as MAX_TRANSACTION
 from .transaction import MIN_SIZE as MIN_TRANSACTION
-from .transaction import Transaction, check_work, parse_worked
+from .transaction import Transaction, parse_worked, worked
 from .wire import Reader, Refusal
 
 VERSION = 1
@@ -201,5 +201,5 @@ class Parsers:
     """
 
     message: Callable[[bytes, Config], tuple[AuthorId, Message]] = parse
-    work: Callable[[bytes, Config], None] = check_work
+    worked: Callable[[bytes, Config], TransactionId] = worked
     transaction: Callable[[bytes, Config], Transaction] = parse_worked

@@ -28,10 +28,10 @@ from .model import (
     FrameId,
     Int32s,
     Int64s,
-    QuantisedCycle,
     quantise_pose,
 )
 from .payload import CERTAIN, Anchor, Link, Payload, Sighting
+from .quantising import QuantisedCycle
 from .rearranging import LEFT, Rearranging
 from .transaction import Transaction
 

@@ -9,9 +9,10 @@ from . import messages
 from .config import Config
 from .issuance import Allowance
 from .messages import Heads, Message
-from .model import AuthorId, Event, Outgoing, QuantisedCycle
+from .model import AuthorId, Event, Outgoing
 from .observing import Observing, Settled
 from .overhead import Controller
+from .quantising import QuantisedCycle
 from .shaping import Shaper, Urgency
 from .sync import Post, Sync
 

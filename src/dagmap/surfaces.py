@@ -140,8 +140,7 @@ class Surfaces:
                 features = cloud.read_on(ledger.chain(author), self._config)
                 if features < 0:
                     break
-                if features:
-                    spent += 1 + features // _DECODED
+                spent += 1 + features // _DECODED
         return spent
 
     def _search(self) -> Iterator[int]:

@@ -36,7 +36,7 @@ _MINOR = 0.015  # of the surfels: fewer make no axis
 _MODES, _SAMPLED = 128, 2500  # surfels that axes are looked for among
 _ORIGINS = slice(10, 13)  # columns of the moments
 _WIDE = 100_000  # smallest cells from the middle: what lies further away is left out
-_UNIT_POINTS, _UNIT_RAYS = 4000, 1000
+_UNIT_POINTS, _UNIT_RAYS, _UNIT_CELLS = 4000, 1000, 1 << 18
 _BITS = 21  # of a key, for each axis
 
 
@@ -118,10 +118,12 @@ def kinds_of(normals: Floats, axes: Floats) -> Int64s:
 def survey(points: Floats, origins: Floats, groups: Int64s, fine: float) -> Working[Surfels | None]:
     """Surfels of points (N, 3) that were seen from `origins` (N, 3) in keyframes `groups` (N,).
 
-    fine: mm, the smallest cell. None where too little is flat.
+    fine: mm, the smallest cell. None where too little is flat, or most lies too far from the rest.
     """
     cell, origin = fine, np.median(points, axis=0)
     near = np.abs(points - origin).max(axis=1) < _WIDE * fine
+    if not near.any():
+        return None
     points, origins, groups = points[near] - origin, origins[near] - origin, groups[near]
     while True:
         order, keys, ends = _sorted(points, cell)
@@ -295,16 +297,22 @@ def _fill(surfels: Surfels, points: Floats, origins: Floats, smooth: Bools) -> W
     np.bitwise_or.at(surfels.cells, own[rows], (1 << surfels.kinds[rows]).astype(np.int32))
     for _ in _dilate(surfels.cells.reshape(shape)):
         yield 4
-    free = (passes >= _PASSES) & (passes > 2 * ended) & (surfels.cells == 0)
-    surfels.cells[free] = FREE
-    yield 8
+    for at in range(0, len(passes), _UNIT_CELLS):
+        slab = slice(at, at + _UNIT_CELLS)
+        proven = (passes[slab] >= _PASSES) & (passes[slab] > 2 * ended[slab])
+        surfels.cells[slab][proven & (surfels.cells[slab] == 0)] = FREE
+        yield 8
 
 
 def _dilate(grid: Int32s) -> Iterator[None]:
-    """Spread the bits of every cell to its 26 neighbours."""
+    """Spread the bits of every cell to its 26 neighbours, in slabs of some `_UNIT_CELLS`."""
     for axis in range(3):
-        rows = np.moveaxis(grid, axis, 0)
-        before = rows.copy()
-        rows[1:] |= before[:-1]
-        rows[:-1] |= before[1:]
-        yield
+        across = max({0, 1, 2} - {axis}, key=lambda other: grid.shape[other])
+        rows = np.moveaxis(grid, (axis, across), (0, 1))
+        thick = max(1, _UNIT_CELLS * rows.shape[1] // rows.size)
+        for at in range(0, rows.shape[1], thick):
+            slab = rows[:, at : at + thick]
+            before = slab.copy()
+            slab[1:] |= before[:-1]
+            slab[:-1] |= before[1:]
+            yield

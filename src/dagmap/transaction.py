@@ -117,13 +117,13 @@ def glance(data: bytes) -> tuple[AuthorId, TransactionId | None]:
 
 def parse(data: bytes, config: Config) -> Transaction:
     """Judge foreign bytes. Raises Refusal; the cheap checks come first, the payload last."""
-    check_work(data, config)
+    worked(data, config)
     return parse_worked(data, config)
 
 
-def check_work(data: bytes, config: Config) -> None:
-    """What is judged first of all, without reading on: a flood that has not worked costs one
-    hash of its bytes. Raises Refusal."""
+def worked(data: bytes, config: Config) -> TransactionId:
+    """The id of foreign bytes that were worked for. It is judged first of all, without reading
+    on: a flood that has not worked costs one hash of its bytes. Raises Refusal."""
     if not MIN_SIZE <= len(data) <= MAX_SIZE:
         reason = Reason.MALFORMED if len(data) > MAX_SIZE else Reason.TRUNCATED
         raise Refusal(reason, f"transaction of {len(data)} bytes")
@@ -131,6 +131,7 @@ def check_work(data: bytes, config: Config) -> None:
         raise Refusal(Reason.VERSION, f"transaction version {data[0]}")
     if not _work_holds(_work_seed(config, data[:-_END]), data[-_END:-64], config):
         raise Refusal(Reason.PROOF_OF_WORK, fault=author_of(data[1:_START]))
+    return id_of(data)
 
 
 def parse_worked(data: bytes, config: Config) -> Transaction:

@@ -165,7 +165,7 @@ def gone(found: Evidence, place: Int64s, moment: Int64s) -> Bools:
 def _about(cubes: Int64s, values: npt.NDArray[np.generic], groups: Int64s | None = None) -> Int64s:
     """Sums of whole values (k, N) over the 27 cubes about each cube; or about each group, where a
     group is a part of a cube: cubes times its kind, plus the place of its cube in `cubes`
-    (ascending)."""
+    (ascending). Values may be floats, as `bincount` adds them up: below 2^53 that is exact."""
     whole = values.astype(np.int64)
     out = np.zeros_like(whole)
     kind, at = np.divmod(np.arange(len(cubes)) if groups is None else groups, len(cubes))

@@ -19,6 +19,8 @@ app = typer.Typer(
 app.add_typer(keys, name="keys")
 
 
+_Camera = Annotated[Path | None, typer.Option(help="camera.json to use, not the folder's own.")]
+_MaxFeatures = Annotated[int, typer.Option(help="Points a frame gives at most.")]
 _MaxDepth = Annotated[float | None, typer.Option(help="Points beyond are dropped, m.")]
 _Topic = Annotated[
     list[str] | None, typer.Option(help="Of a bag: a topic to use; may be repeated.")
@@ -63,7 +65,7 @@ def replay(
         typer.Option(help="A robot that joins at the end and copies the map; may be repeated."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the simulated network.")] = 0,
-    max_features: Annotated[int, typer.Option(help="Points a frame gives at most.")] = 1000,
+    max_features: _MaxFeatures = 1000,
     max_depth: _MaxDepth = None,
     topic: _Topic = None,
     frame: _Frame = None,
@@ -72,9 +74,7 @@ def replay(
     body_poses: _BodyPoses = False,
     voxel: _Voxel = 0.1,
     keep_going: _KeepGoing = False,
-    camera: Annotated[
-        Path | None, typer.Option(help="camera.json to use instead of the folder's own.")
-    ] = None,
+    camera: _Camera = None,
     unknown_frames: Annotated[
         bool,
         typer.Option(
@@ -101,7 +101,7 @@ def replay(
 @app.command()
 def inspect(
     recording: Annotated[Path, typer.Argument(help="A recording of any kind that is read.")],
-    camera: Annotated[Path | None, typer.Option(help="camera.json to use.")] = None,
+    camera: _Camera = None,
     topic: _Topic = None,
     frame: _Frame = None,
     same_frame: _SameFrame = False,
@@ -129,8 +129,8 @@ def tune(
     out: Annotated[
         Path | None, typer.Option(help="TOML file to write; default: the terminal.")
     ] = None,
-    camera: Annotated[Path | None, typer.Option(help="camera.json to use.")] = None,
-    max_features: Annotated[int, typer.Option(help="Points a frame gives at most.")] = 1000,
+    camera: _Camera = None,
+    max_features: _MaxFeatures = 1000,
     max_depth: _MaxDepth = None,
     topic: _Topic = None,
     frame: _Frame = None,

@@ -25,15 +25,13 @@ def show_source(path: Path, options: Options, as_json: bool) -> int:
 
 def tell_notes(source: Source, console: Console) -> None:
     """What was chosen of a recording, and what is only assumed of it."""
-    for note in getattr(source, "notes", ()):
+    for note in source.notes:
         console.print(f"{source.name}: {note}", soft_wrap=True, markup=False)
 
 
 def tell_skips(source: Source, console: Console) -> None:
     """What --keep-going has left out."""
-    skips = getattr(source, "skips", None)
-    if skips is None or not skips.count:
-        return
+    skips = source.skips
     for line in skips.told:
         console.print(f"left out: {line}", soft_wrap=True, markup=False)
     if skips.count > len(skips.told):

@@ -16,9 +16,11 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from ..io.clouds import read_cloud
 from ..io.export import atomic_write
 from ..io.sources import open_source
-from ..model import Cycle, DagmapError, State
+from ..metrics import check_cloud
+from ..model import Cycle, DagmapError, Floats, State
 from ..sim.mission import Mission, Report
 from ..sim.scenario import Scenario, load_scenario
 from ..sim.sweep import Failure, minimised, sweep, timeline_of
@@ -61,7 +63,13 @@ class Simulate:
         recordings = _recordings(scenario.drawn(self.seed), path.parent)
         timeline = Timeline(lambda: mission.fleet.now)
         wanted = self.timeline is not None
-        mission = Mission(scenario, self.seed, recordings, timeline if wanted else None)
+        mission = Mission(
+            scenario,
+            self.seed,
+            recordings,
+            timeline if wanted else None,
+            reference=_reference(scenario, path.parent),
+        )
         with Progress(*_COLUMNS, TimeElapsedColumn(), console=self.console) as progress:
             task = progress.add_task("simulating", total=round(scenario.seconds))
             report = mission.run(
@@ -116,6 +124,14 @@ def _recordings(scenario: Scenario, folder: Path) -> dict[str, Iterable[Cycle]]:
     """The recordings that a scenario names, relative to its file, by robot."""
     sources = [open_source(folder / name, max_features=1000) for name in scenario.recordings]
     return dict(zip(scenario.names, sources, strict=False))
+
+
+def _reference(scenario: Scenario, folder: Path) -> Floats | None:
+    """The points of the file that the scenario names, relative to its own."""
+    if scenario.reference is None:
+        return None
+    path = folder / scenario.reference
+    return check_cloud(read_cloud(path).positions, str(path))
 
 
 def _told(failure: Failure) -> str:

@@ -13,9 +13,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..model import Int32s, Int64s
+from ..model import Bools, Int32s, Int64s
 from .jit import inner, leaf
-from .rays import BRICK, CELLS, ENDS, ENTRY, LOW, ROWS, TOUCHED, ZERO, ZEROED, Marks
+from .rays import BRICK, CELLS, ENDS, ENTRY, LOW, ROWS, TOUCHED, ZERO, ZEROED, Marks, list_cells
 
 Int8s: TypeAlias = npt.NDArray[np.int8]
 
@@ -29,6 +29,8 @@ BRICKS, ENTRIES, SMALL, WIDE, FREE_BRICK, FREE_ENTRY, FREE_SMALL, FREE_WIDE, LIV
 OLDER, FIRST = 3, 4  # columns of Bricks.brick after x y z
 AUTHOR, NEXT, PASS, END = 0, 1, 2, 10  # columns of Bricks.entry; PASS and END: 8 blocks each,
 NONE = -1  # a small one from 0 up, a wide one from -2 down, or none
+# What a walk is at, in this order; each may run out of room of its own.
+LISTING, FINDING, ADDING, DONE = range(4)
 
 
 class Bricks(NamedTuple):
@@ -132,7 +134,39 @@ def _widen(top: Int64s, small: Int8s, word: Int32s, wide: Int32s, c: int) -> int
 
 
 @leaf
-def find_entries(bricks: Bricks, marks: Marks, author: int) -> bool:
+def walk(
+    bricks: Bricks,
+    marks: Marks,
+    cell: int,
+    limit: int,
+    author: int,
+    origins: Int32s,
+    starts: Int64s,
+    xyz: Int32s,
+    alive: Bools,
+    sign: int,
+    at: Int64s,
+) -> int:
+    """Add `sign` in the cells of one transaction's rays and ends; see `evidence`.
+
+    at: (2,) what the walk is at and how many cells it has added, zeros for a new one. Returns what
+    it is at: DONE, or what there is too little room for; give it more and call again.
+    """
+    if at[0] == LISTING and list_cells(marks, cell, limit, origins, starts, xyz, alive):
+        at[0] = FINDING
+    if at[0] == FINDING and _find_entries(bricks, marks, author):
+        at[0] = ADDING
+    if at[0] == ADDING:
+        at[1] = _add_cells(bricks, marks, sign, int(at[1]))
+        if at[1] == marks.top[CELLS]:
+            if marks.top[ZEROED]:
+                _free_zeros(bricks, marks)
+            at[0] = DONE
+    return int(at[0])
+
+
+@leaf
+def _find_entries(bricks: Bricks, marks: Marks, author: int) -> bool:
     """Give every row of the marks its entry; False where there is too little room."""
     top, buckets, brick, entry = bricks.top, bricks.buckets, bricks.brick, bricks.entry
     row = marks.row
@@ -156,7 +190,7 @@ def find_entries(bricks: Bricks, marks: Marks, author: int) -> bool:
 def _copy_blocks(
     entry: Int32s, small: Int8s, row: Int32s, word: Int64s, block: Int32s, rows: int
 ) -> int:
-    """Copy the entries' `pass` blocks to the marks; read where `add_cells` will write.
+    """Copy the entries' `pass` blocks to the marks; read where `_add_cells` will write.
 
     Here the processor waits for many lines of memory at once, there for one after another.
     """
@@ -171,7 +205,7 @@ def _copy_blocks(
 
 
 @leaf
-def add_cells(bricks: Bricks, marks: Marks, sign: int, begin: int) -> int:
+def _add_cells(bricks: Bricks, marks: Marks, sign: int, begin: int) -> int:
     """Add `sign` to the counters of what is listed, from `begin` on.
 
     Returns how many cells are listed, or the one before which blocks run out.
@@ -260,7 +294,7 @@ def _drop(bricks: Bricks, x: int, y: int, z: int, e: int) -> None:
 
 
 @leaf
-def free_zeros(bricks: Bricks, marks: Marks) -> None:
+def _free_zeros(bricks: Bricks, marks: Marks) -> None:
     """Free the blocks that have become zero, and the entries and bricks that this leaves empty."""
     entry, row = bricks.entry, marks.row
     for r in range(int(marks.top[ROWS])):

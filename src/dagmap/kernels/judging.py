@@ -2,8 +2,20 @@
 
 from __future__ import annotations
 
-from ..model import Bools, Int32s, Int64s
-from .bricks import AUTHOR, END, FIRST, NEXT, NONE, PASS, Bricks, count_at, find_brick
+from ..model import Bools, Int32s, Int64s, Uint8s
+from .bricks import (
+    AUTHOR,
+    BRICKS,
+    END,
+    FIRST,
+    LAYERS,
+    NEXT,
+    NONE,
+    PASS,
+    Bricks,
+    count_at,
+    find_brick,
+)
 from .jit import inner, leaf
 from .rays import ceil_sqrt
 
@@ -38,8 +50,24 @@ def _read_cell(bricks: Bricks, e: int, layer: int, at: int, part: Int32s, touche
 
 
 @inner
+def _mark_ends(bricks: Bricks, solid: Uint8s) -> None:
+    """Set the bit of every cell in which points of anybody end. Most of a ray's cells have none."""
+    for b in range(int(bricks.top[BRICKS])):
+        e = int(bricks.brick[b, FIRST])
+        while e >= 0:
+            for layer in range(LAYERS):
+                c = int(bricks.entry[e, END + layer])
+                for at in range(64 if c != NONE else 0):
+                    if count_at(bricks.small, bricks.wide, c, at) > 0:
+                        row = layer << 3 | at >> 3
+                        solid[b, row] = int(solid[b, row]) | 1 << (at & 7)
+            e = int(bricks.entry[e, NEXT])
+
+
+@inner
 def _read_ray(
     bricks: Bricks,
+    solid: Uint8s,
     cell: int,
     limit: int,
     origin: Int32s,
@@ -59,7 +87,7 @@ def _read_ray(
     ox, oy, oz = (x + dx) // cell, (y + dy) // cell, (z + dz) // cell
     lx, ly, lz = x // cell, y // cell, z // cell  # the cell looked up before
     bx = by = bz = _NEVER
-    first = -1
+    b = -1
     for s in range(cell, min(length - cell, limit), max(1, cell // 2)):
         cx, cy, cz = (x + dx * s // length) // cell, (y + dy * s // length) // cell, 0
         cz = (z + dz * s // length) // cell
@@ -69,9 +97,10 @@ def _read_ray(
         if cx >> 3 != bx or cy >> 3 != by or cz >> 3 != bz:
             bx, by, bz = cx >> 3, cy >> 3, cz >> 3
             b = find_brick(bricks.top, bricks.buckets, bricks.brick, bx, by, bz)
-            first = int(bricks.brick[b, FIRST]) if b >= 0 else -1
+        if b < 0 or not solid[b, (cz & 7) << 3 | (cy & 7)] >> (cx & 7) & 1:
+            continue
         at = (cy & 7) << 3 | (cx & 7)
-        e = first
+        e = int(bricks.brick[b, FIRST])
         while e >= 0:
             c = int(bricks.entry[e, END + (cz & 7)])
             ended = 0 if c == NONE else count_at(bricks.small, bricks.wide, c, at)
@@ -95,6 +124,7 @@ def judge(
     entries: Int32s,
     part: Int32s,
     touched: Int32s,
+    solid: Uint8s,
     out: Int32s,
     denied: Bools,
 ) -> None:
@@ -102,7 +132,7 @@ def judge(
 
     say: (4,) at most of an author's hits, misses, passes (and as many ends), and ends before the
     node. seed, origin, first, entries: see `matching.Nodes`. part: (A, 4) zeros, and zeros again
-    afterwards; touched: (A,).
+    afterwards; touched: (A,); solid: (B, 64) zeros, a bit for every cell of every brick.
     out: (N, 7) is written: hits, witnesses, against, distance, passed, ended, hidden.
     denied: (E,) is written: by entry, whether more of the author's own passes than ends are there;
     who has no row in `part` has no rays.
@@ -110,6 +140,7 @@ def judge(
     top, buckets, brick = bricks.top, bricks.buckets, bricks.brick
     bx = by = bz = _NEVER  # the brick of the node before, most often this one's too
     newest = -1
+    _mark_ends(bricks, solid)
     for node in range(out.shape[0]):
         x, y, z = int(seed[node, 0]), int(seed[node, 1]), int(seed[node, 2])
         cx, cy, cz = x // cell, y // cell, z // cell
@@ -121,7 +152,9 @@ def judge(
         dx, dy, dz = x - int(origin[node, 0]), y - int(origin[node, 1]), z - int(origin[node, 2])
         length = ceil_sqrt(dx * dx + dy * dy + dz * dz)
         count = _read_cell(bricks, newest, cz & 7, at, part, touched)
-        count = _read_ray(bricks, cell, limit, origin, seed, node, length, part, touched, count)
+        count = _read_ray(
+            bricks, solid, cell, limit, origin, seed, node, length, part, touched, count
+        )
         h = w = 0
         mine = int(first[node])
         while mine >= 0:

@@ -11,6 +11,7 @@ from .jit import inner, leaf
 
 SHIFT = 8  # a cell has 2^8 steps along each axis
 MANY = 255  # rays through a cell that are counted
+LONGEST = 1024  # steps of a ray that are looked at, before its end: no sensor sees further
 
 
 @inner
@@ -28,14 +29,14 @@ def pass_through(
 ) -> None:
     """Count in `passes` (cells,) the rays (N, 3) to (N, 3) that pass through a cell.
 
-    A ray is looked at once a cell of its longest axis, and no more from `short` such steps before
-    its end on.
+    A ray is looked at once a cell of its longest axis, no earlier than LONGEST such steps before
+    its end, and no more from `short` of them on.
     """
     for i in range(points.shape[0]):
         x, y, z = int(origins[i, 0]), int(origins[i, 1]), int(origins[i, 2])
         dx, dy, dz = int(points[i, 0]) - x, int(points[i, 1]) - y, int(points[i, 2]) - z
         steps = (max(abs(dx), abs(dy), abs(dz)) >> SHIFT) + 1
-        for s in range(steps - short):
+        for s in range(max(0, steps - short - LONGEST), steps - short):
             at = _at(x + dx * s // steps, y + dy * s // steps, z + dz * s // steps, shape)
             if at >= 0 and passes[at] < MANY:
                 passes[at] += 1

@@ -11,7 +11,18 @@ from typing import TypeAlias
 
 import msgspec
 
-from ..model import Accepted, ConfigError, Cycle, Forked, Issued, MapChanged, Rejected, State
+from ..metrics import nearest, thin
+from ..model import (
+    Accepted,
+    ConfigError,
+    Cycle,
+    Floats,
+    Forked,
+    Issued,
+    MapChanged,
+    Rejected,
+    State,
+)
 from ..worldmap import WorldMap
 from .fleet import Check, Fleet
 from .liars import make_liar
@@ -19,7 +30,7 @@ from .network import Network, Position
 from .robot import Costs, Happening, Recording, Restarted, Robot, Source, Timed
 from .scenario import Scenario
 from .scene import Scene, Walker
-from .truth import Lies, Quality, judge_lies, judge_quality
+from .truth import Lies, Quality, judge_lies, judge_quality, seen_by
 
 Told: TypeAlias = Callable[[float], None]
 SAMPLE = 1.0  # s between two looks at how far apart the robots are
@@ -80,7 +91,8 @@ def _without_collector() -> Iterator[None]:
 class Mission:
     """A scenario with a seed. The same two give the same timeline.
 
-    recordings: cycles by robot, in place of the synthetic scene.
+    recordings: cycles by robot, in place of the synthetic scene. reference: (N, 3) m in the fleet
+    frame, what is truly there, to judge maps of recordings by.
     """
 
     def __init__(
@@ -90,7 +102,9 @@ class Mission:
         recordings: dict[str, Iterable[Cycle]] | None = None,
         on_event: Callable[[Robot, Happening], None] | None = None,
         check: Check | None = None,
+        reference: Floats | None = None,
     ) -> None:
+        self._reference = reference
         self.scenario, self.seed = scenario.drawn(seed), seed
         self._on_event, self._rejected = on_event, Counter[str]()
         self._scene: Scene | None = None
@@ -269,9 +283,12 @@ class Mission:
         return spent
 
     def _quality(self, world: WorldMap) -> Quality | None:
-        if self._scene is None:
+        if self._scene is not None:
+            return judge_quality(world, seen_by(self._walkers, self.honest), self._scene.distance)
+        if self._reference is None:
             return None
-        return judge_quality(world, self._walkers, self.honest, self._scene)
+        there = thin(self._reference)
+        return judge_quality(world, there, lambda cloud: nearest(cloud, there))
 
     def _report(self, took: float | None, digests: set[bytes], wall: float) -> Report:
         robots, honest = list(self.fleet.robots.values()), self.honest

@@ -74,7 +74,8 @@ class Scenario(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A mission: robots in a scene, a network between them, and what goes wrong.
 
     robots: all of them, the liars included (they are the last). Either they walk through a
-    synthetic scene, or `recordings` (one a robot, files) are what they see.
+    synthetic scene, or `recordings` (one a robot, files) are what they see; then `reference` may
+    be a file of the points that are truly there.
     seconds: of mission; patience: seconds that the fleet gets afterwards to agree.
     """
 
@@ -89,6 +90,7 @@ class Scenario(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):
     sensor: SensorConfig = SensorConfig()
     motion: MotionConfig = MotionConfig()
     recordings: tuple[str, ...] = ()
+    reference: str | None = None
     link: Link = Link()
     clocks: Clocks = Clocks()
     costs: Costs = Costs()
@@ -112,6 +114,8 @@ class Scenario(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):
             "recordings",
             f"one for each of the {self.robots} robots",
         )
+        needed = self.reference is None or bool(self.recordings)
+        self._require(needed, "reference", "recordings beside it (a scene is its own truth)")
         placed = not self.recordings or self.link.reach is None
         self._require(placed, "recordings", "a link without reach, for want of true positions,")
         known = set(self.names)

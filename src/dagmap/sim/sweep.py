@@ -42,10 +42,13 @@ class Failure(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def attempt(
-    scenario: Scenario, seed: int, recordings: dict[str, Iterable[Cycle]] | None = None
+    scenario: Scenario,
+    seed: int,
+    recordings: dict[str, Iterable[Cycle]] | None = None,
+    invariants: Invariants | None = None,
 ) -> Failure | None:
     """Run a scenario with every invariant checked after every event."""
-    return _watched(scenario, seed, recordings)[0]
+    return _watched(scenario, seed, recordings, invariants=invariants)[0]
 
 
 def timeline_of(scenario: Scenario, seed: int) -> list[str]:
@@ -97,9 +100,10 @@ def _watched(
     seed: int,
     recordings: dict[str, Iterable[Cycle]] | None = None,
     most: int | None = None,
+    invariants: Invariants | None = None,
 ) -> tuple[Failure | None, Timeline]:
     """most: events of a timeline beyond which nobody wants to know of a failure."""
-    invariants = Invariants()
+    invariants = Invariants() if invariants is None else invariants
     timeline = Timeline(lambda: mission.fleet.now)
 
     def on_event(robot: Robot, happening: Happening) -> None:
@@ -141,7 +145,7 @@ def _attempts(work: list[tuple[Scenario, int]], jobs: int) -> Iterator[Failure |
         try:
             yield from pool.map(_attempt, work, chunksize=_CHUNK)
         finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+            pool.shutdown(cancel_futures=True)
 
 
 def _attempt(item: tuple[Scenario, int]) -> Failure | None:

@@ -22,11 +22,7 @@ class Timeline:
     def __call__(self, robot: Robot, happening: Happening) -> None:
         text = _text(happening)
         if text is not None:
-            self.note(robot.name, text)
-
-    def note(self, who: str, text: str) -> None:
-        """Something that is not a robot's event."""
-        self._sink(f"{self._now():.6f} {who} {text}")
+            self._sink(f"{self._now():.6f} {robot.name} {text}")
 
 
 def _text(happening: Happening) -> str | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 
@@ -14,7 +14,7 @@ from ..consensus import Consensus
 from ..contribution import Author
 from ..fold import DefaultFold
 from ..metrics import nearest, thin
-from ..model import AuthorId, Bools, FrameId, Int32s, State
+from ..model import AuthorId, Bools, Floats, FrameId, Int32s, State
 from ..transaction import Transaction
 from ..worldmap import WorldMap
 from .robot import Robot
@@ -25,9 +25,9 @@ FALSE = 0.15  # m from everything real: a point that is confirmed there was inve
 
 
 class Quality(msgspec.Struct, frozen=True, kw_only=True):
-    """The map (confirmed and tentative nodes, thinned) against the scene."""
+    """The map (confirmed and tentative nodes, thinned) against the scene, or a reference."""
 
-    accuracy: float  # m, mean distance of a node to the nearest surface, exact
+    accuracy: float  # m, mean distance of a node to the nearest surface (of a scene: exact)
     completeness: float  # m, mean distance of a true place that was seen to the nearest node
     precision: float  # share of nodes within `NEAR` of a surface
     recall: float  # share of places within `NEAR` of a node
@@ -51,19 +51,18 @@ class Lies(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def judge_quality(
-    world: WorldMap, walkers: Mapping[str, Walker], honest: Sequence[Robot], scene: Scene
+    world: WorldMap, places: Floats, distance: Callable[[Floats], Floats]
 ) -> Quality | None:
     """How near the map is to the truth.
 
-    None where the map or what was seen is empty, or scipy is missing (the extra `evaluate`).
+    places: (N, 3) m that a complete map holds. distance: of points (M, 3) m from what is there.
+    None where the map or the places are empty, or scipy is missing (the extra `evaluate`).
     """
-    seen = [walkers[robot.name].seen().reference for robot in honest if robot.name in walkers]
-    reference = np.concatenate([np.zeros((0, 3)), *seen])
     nodes = world.positions[world.kept]
-    if not len(nodes) or not len(reference) or find_spec("scipy") is None:
+    if not len(nodes) or not len(places) or find_spec("scipy") is None:
         return None
-    cloud, places = thin(nodes), thin(reference)
-    there, back = scene.distance(cloud), nearest(places, cloud)
+    cloud, wanted = thin(nodes), thin(places)
+    there, back = distance(cloud), nearest(wanted, cloud)
     precision, recall = float((there <= NEAR).mean()), float((back <= NEAR).mean())
     both = precision + recall
     return Quality(
@@ -73,6 +72,12 @@ def judge_quality(
         recall=recall,
         f_score=2 * precision * recall / both if both else 0.0,
     )
+
+
+def seen_by(walkers: Mapping[str, Walker], honest: Sequence[Robot]) -> Floats:
+    """(N, 3) m: what these robots' sensors truly saw of the scene."""
+    seen = [walkers[robot.name].seen().reference for robot in honest if robot.name in walkers]
+    return np.concatenate([np.zeros((0, 3)), *seen])
 
 
 def judge_lies(

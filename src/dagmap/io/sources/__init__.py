@@ -60,8 +60,7 @@ def describe_source(path: Path | str, options: Options | None = None) -> Descrip
     if hasattr(reader, "describe"):
         return cast(Description, reader.describe(path, options))
     source = reader.open(path, options)
-    notes = getattr(source, "notes", ())
-    return Description(reader.UNDERSTANDS, cycles=len(source), notes=notes)
+    return Description(reader.UNDERSTANDS, cycles=len(source), notes=source.notes)
 
 
 def _reader_of(path: Path) -> _Reader:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import struct
 from collections.abc import Callable, Iterator
@@ -118,10 +119,10 @@ def _fields(data: bytes) -> dict[bytes, bytes]:
 
 def _exactly(file: IO[bytes], size: int) -> bytes:
     at = file.tell()
-    data = file.read(size) if size <= _MOST else b""
-    if len(data) < size:
-        raise Cut(f"{size} bytes are promised at {at}, {len(data)} are there")
-    return data
+    there = os.fstat(file.fileno()).st_size - at
+    if size > min(there, _MOST):  # before memory is taken for it
+        raise Cut(f"{size} bytes are promised at {at}, {there} are there")
+    return file.read(size)
 
 
 def _plain(data: bytes, size: int) -> bytes:
@@ -144,7 +145,8 @@ def mcap_records(path: Path) -> Iterator[Record]:
     topics: dict[int, tuple[str, int]] = {}
     with path.open("rb") as file:
         try:
-            reader = streams.StreamReader(file, record_size_limit=_MOST, emit_chunks=True)
+            most = min(_MOST, path.stat().st_size)
+            reader = streams.StreamReader(file, record_size_limit=most, emit_chunks=True)
             for record in _in_chunks(reader.records, streams, kinds, Budget(path)):
                 if isinstance(record, kinds.Schema):
                     schemas[record.id] = (record.name, record.data.decode("utf-8", "replace"))

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from ...model import ConfigError, Cycle, CycleError, RecordingError, quantise_cycle
+from ...model import ConfigError, Cycle, CycleError, RecordingError
+from ...quantising import quantise_cycle
 
-Row = tuple[int, list[str]]  # number of a line, from 1, and its words
 _S = TypeVar("_S")
 _T = TypeVar("_T")
 _TOLD = 20  # things that were left out and are told of one by one
@@ -21,6 +20,8 @@ class Source(Protocol):
     """A recording. It can be iterated again, and gives the same cycles."""
 
     name: str  # the folder's name or the file's stem: what the robot is called
+    notes: tuple[str, ...]  # where its poses come from, and what is only assumed of them
+    skips: Skips
 
     def __len__(self) -> int:
         """Cycles that iterating gives."""
@@ -76,6 +77,17 @@ class Description:
     notes: tuple[str, ...] = ()
 
 
+def described(
+    kind: str, items: tuple[Item, ...], opened: Callable[[], Source], *more: str
+) -> Description:
+    """What there is, with what opening it tells. more: notes that concern every one of its kind."""
+    try:
+        source = opened()
+    except RecordingError as error:
+        return Description(kind, items, None, str(error))
+    return Description(kind, items, len(source), None, (*source.notes, *more))
+
+
 @dataclass(slots=True)
 class Skips:
     """What was left out of a recording, because `keep_going` says so; once, however often it is
@@ -99,33 +111,16 @@ class Skips:
             self.told.append(str(error))
 
 
-def readable(items: Iterable[_S], convert: Callable[[_S], _T], skips: Skips) -> list[_T]:
-    """What `convert` makes of lines or files, but for those at which it raises RecordingError."""
-    found = []
+def kept(items: Iterable[_S], convert: Callable[[_S], _T], skips: Skips) -> Iterator[_T]:
+    """What `convert` makes of lines, files or frames, but for those at which it raises
+    RecordingError: these are skipped, or end it."""
     for item in items:
         try:
-            found.append(convert(item))
+            found = convert(item)
         except RecordingError as error:
             skips.note(error)
-    return found
-
-
-def rising(items: Iterable[tuple[float, str, _T]], skips: Skips) -> list[_T]:
-    """Of (stamp, where it stands, item) those whose stamp comes after the one before."""
-    found: list[_T] = []
-    last = -math.inf
-    for stamp, where, item in items:
-        if stamp <= last:
-            skips.note(
-                RecordingError(
-                    f"{where}: the stamp {stamp} does not come after {last}; stamps must rise, "
-                    "sort the lines and drop doubles"
-                )
-            )
             continue
-        last = stamp
-        found.append(item)
-    return found
+        yield found
 
 
 def folder_name(path: Path) -> str:
@@ -152,20 +147,3 @@ def read_bytes(path: Path) -> bytes:
         raise RecordingError(f"{path}: no file can have this name; correct the list") from None
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror})") from None
-
-
-def shown(words: list[str]) -> str:
-    """Words of a line for an error: the first few, none of them long."""
-    parts = [repr(word[:30]) for word in words[:8]]
-    return f"[{', '.join(parts)}{', ...' if len(words) > 8 else ''}]"
-
-
-def read_rows(path: Path) -> list[Row]:
-    """Rows of a text file of the TUM benchmark: (line number from 1, words). `#` is a comment."""
-    try:
-        text = read_bytes(path).decode()
-    except UnicodeDecodeError:
-        raise RecordingError(f"{path}: not a text file in UTF-8; write it anew") from None
-    lines = ((number, line.strip()) for number, line in enumerate(text.splitlines(), 1))
-    rows = [(number, line.replace(",", " ").split()) for number, line in lines if line[:1] != "#"]
-    return [(number, words) for number, words in rows if words]

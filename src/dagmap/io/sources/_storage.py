@@ -155,8 +155,8 @@ class PackedFolder:
 def packed_folder(path: Path) -> PackedFolder | None:
     """The folder unpacked; None where nothing of it is packed by zstd.
 
-    Raises ValueError where its index repeats itself by reference, and what ruamel.yaml does: a few
-    lines of that can claim any size.
+    Raises ValueError where its index repeats itself by reference, since a few lines of that can
+    claim any size, or names a file twice; and what ruamel.yaml does.
     """
     if not (path / _INDEX).is_file():
         return None
@@ -172,4 +172,6 @@ def packed_folder(path: Path) -> PackedFolder | None:
         return None
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         return None  # rosbags says what is wrong with it
+    if len({Path(name).name for name in names}) < len(names):  # each time would cost as much again
+        raise ValueError(f"{_INDEX} names a file twice")
     return PackedFolder(path, said)

@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
 
-from ...model import RecordingError
+from ...model import Floats, RecordingError
+from ._lists import Row, read_rows
 from ._poses import Trajectory, matrix
-from ._source import Row, Skips, read_rows, readable
+from ._source import Skips, kept
 
 _NANOSECONDS = 1e14  # what is larger is no stamp in s: ORB-SLAM3 writes EuRoC's ns as they are
-
-
-def numbers(file: Path, number: int, words: list[str], count: int) -> list[float]:
-    """The finite numbers of a line. Raises RecordingError where they are not `count`."""
-    try:
-        values = [float(word) for word in words]
-    except ValueError:
-        values = []
-    if len(values) != count or not np.isfinite(values).all():
-        raise RecordingError(f"{file}, line {number}: {count} finite numbers are wanted")
-    return values
 
 
 def doubts(file: Path, same: bool) -> tuple[str, ...]:
@@ -43,12 +34,22 @@ def doubts(file: Path, same: bool) -> tuple[str, ...]:
 
 def _first_stamp(file: Path) -> float:
     """Of the first line that begins with a number."""
-    for _, words in read_rows(file):
+    for row in read_rows(file):
         try:
-            return float(words[0])
+            return float(row.words[0])
         except ValueError:
             continue
     return 0.0
+
+
+def stamped_pose(row: Row) -> tuple[float, Floats]:
+    """Stamp in s and (4, 4) pose of `stamp x y z qx qy qz qw`. Raises RecordingError."""
+    stamp, *values = row.numbers(8, names="stamp x y z qx qy qz qw")
+    pose = matrix(np.array(values[:3]), np.array(values[3:]))
+    if pose is None:
+        length = math.hypot(*values[3:])
+        raise RecordingError(f"{row.where}: a quaternion of length {length:.3g}; 1 is wanted")
+    return stamp / 1e9 if stamp > _NANOSECONDS else stamp, pose
 
 
 def read_tum(file: Path, skips: Skips) -> Trajectory:
@@ -57,15 +58,8 @@ def read_tum(file: Path, skips: Skips) -> Trajectory:
     Raises RecordingError.
     """
     out = Trajectory()
-
-    def add(row: Row) -> None:
-        stamp, *values = numbers(file, *row, 8)
-        pose = matrix(np.array(values[:3]), np.array(values[3:]))
-        if pose is None:
-            raise RecordingError(f"{file}, line {row[0]}: the quaternion is not of length 1")
-        out.add(stamp / 1e9 if stamp > _NANOSECONDS else stamp, pose)
-
-    readable(read_rows(file), add, skips)
+    for stamp, pose in kept(read_rows(file), stamped_pose, skips):
+        out.add(stamp, pose)
     if not len(out):
         raise RecordingError(f"{file}: no poses; a line `stamp x y z qx qy qz qw` each is wanted")
     return out

@@ -18,13 +18,14 @@ import numpy.typing as npt
 
 from ...model import Cycle, Floats, RecordingError, Uint8s
 from ._poses import inverse, matrix
-from ._source import Description, Item, Options, Skips, checked, folder_name, read_bytes
+from ._source import Description, Item, Options, Skips, checked, folder_name, kept, read_bytes
 
 UNDERSTANDS = "a COLMAP model (points3D and images, .bin or .txt)"
 _PLACES = (".", "sparse/0", "sparse")
 _PARTS, _SUFFIXES = ("points3D", "images"), (".bin", ".txt")
 _NO_POINT = np.uint64(2**64 - 1)
 _MOST_NAME = 4096  # bytes
+_SCALE = "lengths are the model's own: scale it to metres first (model_aligner)"
 _T = TypeVar("_T")
 
 
@@ -68,8 +69,7 @@ def describe(path: Path, options: Options) -> Description:
         Item("images", "poses", len(model), "cycles"),
         Item("points3D", "3D points", model.count, "points"),
     )
-    notes = ("lengths are the model's own: scale it to metres first (model_aligner)",)
-    return Description("COLMAP model", items, len(model), None, notes)
+    return Description("COLMAP model", items, len(model), None, model.notes)
 
 
 class ColmapModel:
@@ -78,6 +78,7 @@ class ColmapModel:
     def __init__(self, path: Path, options: Options) -> None:
         self.name, self._options = folder_name(path), options
         self.skips = Skips(options.keep_going)
+        self.notes: tuple[str, ...] = (_SCALE,)
         found = _model(path)
         if found is None:
             raise RecordingError(f"{path}: {_half(path)}")
@@ -103,23 +104,16 @@ class ColmapModel:
         return len(self._pictures)
 
     def __iter__(self) -> Iterator[Cycle]:
-        for i, picture in enumerate(self._pictures):
-            rows = self._rows(picture)
-            back = inverse(picture.pose)
-            with np.errstate(over="ignore", invalid="ignore"):  # what is too far is refused below
-                places = self._points.places[rows] @ back[:3, :3].T + back[:3, 3]
-            try:
-                cycle = checked(
-                    Cycle(
-                        float(i), picture.pose, places, ids=self._points.ids[rows],
-                        colors=self._points.colors[rows],
-                    ),
-                    self._path / picture.name,
-                )  # fmt: skip
-            except RecordingError as error:
-                self.skips.note(error)
-                continue
-            yield cycle
+        yield from kept(range(len(self)), self._cycle, self.skips)
+
+    def _cycle(self, i: int) -> Cycle:
+        picture = self._pictures[i]
+        rows, back = self._rows(picture), inverse(picture.pose)
+        with np.errstate(over="ignore", invalid="ignore"):  # what is too far is refused below
+            places = self._points.places[rows] @ back[:3, :3].T + back[:3, 3]
+        ids, colors = self._points.ids[rows], self._points.colors[rows]
+        cycle = Cycle(float(i), picture.pose, places, ids=ids, colors=colors)
+        return checked(cycle, self._path / picture.name)
 
     def _rows(self, picture: _Picture) -> npt.NDArray[np.int64]:
         """The points that a picture shows; of too many those with the smallest error."""

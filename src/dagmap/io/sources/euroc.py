@@ -8,28 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from ...model import Cycle, Floats, RecordingError, Uint8s
 from . import orbslam
+from ._lists import Row, Stamped, read_rows, stamped_files
 from ._odometry import PictureOdometry
 from ._poses import Trajectory, matrix, nearest
 from ._rgbd import FrontEnd, decode, import_cv2
-from ._source import (
-    Description,
-    Item,
-    Options,
-    Row,
-    Skips,
-    checked,
-    folder_name,
-    read_rows,
-    readable,
-    rising,
-    shown,
-)
+from ._source import Description, Item, Options, Skips, checked, described, folder_name, kept
 from ._stereo import Lens, Stereo, load_lens
 from ._trajectory import doubts, read_tum
 
@@ -40,16 +30,9 @@ _MOST_NS = 1 << 62
 
 
 @dataclass(frozen=True, slots=True)
-class _Picture:
-    stamp: int  # ns
-    file: Path
-    line: str  # where it is named, for errors
-
-
-@dataclass(frozen=True, slots=True)
 class _Pair:
-    left: _Picture
-    right: _Picture
+    left: Stamped  # whole ns
+    right: Stamped
     pose: Floats | None  # of the rectified left camera
 
 
@@ -71,11 +54,7 @@ def describe(path: Path, options: Options) -> Description:
     mav = _mav(path) or path
     counts = {name: _count(mav / name / "data") for name in ("cam0", "cam1")}
     items = tuple(Item(name, "pictures", n, "stereo") for name, n in counts.items())
-    try:
-        source = open(path, options)
-    except RecordingError as error:
-        return Description(UNDERSTANDS, items, None, str(error))
-    return Description(UNDERSTANDS, items, len(source), None, source.notes)
+    return described(UNDERSTANDS, items, partial(open, path, options))
 
 
 class EurocFolder:
@@ -117,23 +96,19 @@ class EurocFolder:
     def __iter__(self) -> Iterator[Cycle]:
         front = FrontEnd(self._cv2, self._stereo.camera, self._options)
         odometry = PictureOdometry(self._cv2, self._stereo.camera)
-        for pair in self._pairs:
-            try:
-                picture, metres = self._stereo.rectified(
-                    self._read(pair.left, 0), self._read(pair.right, 1)
-                )
-                pose = pair.pose
-                pose = odometry.register(picture, metres) if pose is None else pose
-                points, colors, described = front.of(picture, metres)
-                cycle = Cycle(
-                    pair.left.stamp / 1e9, pose, points, colors=colors,
-                    session=max(odometry.session, 0), descriptors=described,
-                )  # fmt: skip
-                cycle = checked(cycle, pair.left.file)
-            except RecordingError as error:
-                self.skips.note(error)
-                continue
-            yield cycle
+
+        def cycle(pair: _Pair) -> Cycle:
+            left, right = self._read(pair.left, 0), self._read(pair.right, 1)
+            picture, metres = self._stereo.rectified(left, right)
+            pose = odometry.register(picture, metres) if pair.pose is None else pair.pose
+            points, colors, described = front.of(picture, metres)
+            found = Cycle(
+                pair.left.stamp / 1e9, pose, points, colors=colors,
+                session=max(odometry.session, 0), descriptors=described,
+            )  # fmt: skip
+            return checked(found, pair.left.file)
+
+        yield from kept(self._pairs, cycle, self.skips)
 
     def _lens(self, name: str) -> Lens:
         folder = self._mav / name
@@ -166,7 +141,7 @@ class EurocFolder:
             return _truth(file, self.skips), (f"poses of {_TRUTH}",)
         return None, (f"no {_TRUTH}: odometry by OpenCV",)
 
-    def _read(self, picture: _Picture, camera: int) -> Uint8s:
+    def _read(self, picture: Stamped, camera: int) -> Uint8s:
         found = decode(self._cv2, picture.file, self._cv2.IMREAD_COLOR)
         width, height = self._sizes[camera]
         if found.shape[:2] != (height, width):
@@ -188,36 +163,16 @@ def _count(folder: Path) -> int:
     return sum(1 for _ in folder.iterdir()) if folder.is_dir() else 0
 
 
-def _pictures(camera: Path, skips: Skips) -> list[_Picture]:
+def _pictures(camera: Path, skips: Skips) -> list[Stamped]:
     """From data.csv, else from the names of the files, which are stamps in ns."""
-    listed = camera / "data.csv"
-
-    def picture(row: Row) -> _Picture:
-        number, words = row
-        line = f"{listed}, line {number}"
-        if len(words) != 2 or "/" in words[1]:
-            raise RecordingError(f"{line}: `stamp in ns,file` is wanted, not {shown(words)}")
-        return _Picture(_ns(words[0], line), camera / "data" / words[1], line)
-
-    if listed.is_file():
-        found = readable(read_rows(listed), picture, skips)
-    else:
-        files = (file for file in (camera / "data").iterdir() if not file.name.startswith("."))
-        found = sorted(readable(files, _by_name, skips), key=lambda picture: picture.stamp)
-    found = rising(((p.stamp, p.line or str(p.file), p) for p in found), skips)
+    data = camera / "data"
+    found = stamped_files(camera / "data.csv", "`stamp in ns,file`", data, data, _ns, skips)
     if not found:
         raise RecordingError(f"{camera}: an empty recording; no pictures are named or there")
     return found
 
 
-def _by_name(file: Path) -> _Picture:
-    remedy = "name pictures by their stamps in ns, or write data.csv"
-    return _Picture(_ns(file.stem, f"{file} ({remedy})"), file, "")
-
-
-def _paired(
-    left: list[_Picture], right: list[_Picture], mav: Path
-) -> list[tuple[_Picture, _Picture]]:
+def _paired(left: list[Stamped], right: list[Stamped], mav: Path) -> list[tuple[Stamped, Stamped]]:
     """Each left picture with the nearest right one, if each is the other's nearest."""
     stamps = [np.array([float(p.stamp - left[0].stamp) for p in part]) for part in (left, right)]
     there, back = nearest(stamps[1], stamps[0]), nearest(stamps[0], stamps[1])
@@ -238,25 +193,24 @@ def _paired(
 
 def _truth(file: Path, skips: Skips) -> Trajectory:
     """Poses of the body: stamp in ns, place, quaternion with w first, and what follows."""
-    out = Trajectory()
 
-    def add(row: Row) -> None:
-        number, words = row
-        line = f"{file}, line {number}"
+    def placed(row: Row) -> tuple[int, Floats]:
         pose = None
-        if len(words) >= 8:
+        if len(row.words) >= 8:
             try:
-                x, y, z, qw, qx, qy, qz = (float(word) for word in words[1:8])
+                x, y, z, qw, qx, qy, qz = (float(word) for word in row.words[1:8])
                 pose = matrix(np.array([x, y, z]), np.array([qx, qy, qz, qw]))
             except ValueError:
                 pose = None
         if pose is None:
             raise RecordingError(
-                f"{line}: `stamp x y z qw qx qy qz` is wanted, the quaternion of length 1"
+                f"{row.where}: `stamp x y z qw qx qy qz` is wanted, the quaternion of length 1"
             )
-        out.add(_ns(words[0], line) / 1e9, pose)
+        return _ns(row.words[0], row.where), pose
 
-    readable(read_rows(file), add, skips)
+    out = Trajectory()
+    for stamp, pose in kept(read_rows(file), placed, skips):
+        out.add(stamp / 1e9, pose)
     if not len(out):
         raise RecordingError(f"{file}: no poses; remove the file for odometry by OpenCV")
     return out

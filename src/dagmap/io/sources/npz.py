@@ -18,10 +18,11 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ...model import DESCRIPTOR, Cycle, CycleError, Int64s, RecordingError, quantise_cycle
+from ...model import DESCRIPTOR, Cycle, CycleError, Int64s, RecordingError
+from ...quantising import quantise_cycle
 from ..export import atomic_write
 from ..npy import BROKEN, read_array, read_header, read_layout, read_members
-from ._source import Options, Skips, checked
+from ._source import Options, Skips, checked, kept
 
 UNDERSTANDS = "a cycle stream (.npz)"
 VERSION = 1
@@ -68,6 +69,7 @@ class CycleStream:
     def __init__(self, path: Path, options: Options) -> None:
         self.name, self._path = path.stem, path
         self.skips = Skips(options.keep_going)
+        self.notes: tuple[str, ...] = ()
         try:
             self._arrays = _load(path)
         except BROKEN as error:  # RecordingError is none of these
@@ -88,27 +90,24 @@ class CycleStream:
         return len(self._kept)
 
     def __iter__(self) -> Iterator[Cycle]:
-        for i in self._kept:
-            try:
-                cycle = checked(self._cycle(i), self._path)
-            except RecordingError as error:
-                self.skips.note(error)
-                continue
-            yield cycle
+        yield from kept(self._kept, self._checked, self.skips)
+
+    def _checked(self, i: int) -> Cycle:
+        return checked(self._cycle(i), self._path)
 
     def _usable(self) -> list[int]:
         """The cycles that an agent takes, by stamps that rise within their session."""
-        kept, last = [], dict[int, float]()
+        found, last = [], dict[int, float]()
         for i in range(len(self._arrays["stamp"])):
             try:
-                cycle = checked(self._cycle(i), self._path)
+                cycle = self._checked(i)
                 if cycle.stamp <= last.get(cycle.session, -np.inf):
                     continue
             except (RecordingError, OverflowError):  # a number that no int64 holds
                 continue
             last[cycle.session] = cycle.stamp
-            kept.append(i)
-        return kept
+            found.append(i)
+        return found
 
     def _cycle(self, i: int) -> Cycle:
         arrays = self._arrays

@@ -13,7 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ...model import Cycle, Floats, RecordingError, Uint8s
-from ._source import Description, Item, Options, Skips, checked, folder_name, read_rows, shown
+from ._lists import read_rows
+from ._source import Description, Item, Options, Skips, checked, folder_name, kept
 from ._stereo import load_lens
 from ._trajectory import doubts, read_tum
 from .scans import READERS
@@ -87,20 +88,17 @@ class OrbSlamMap:
         return len(self._stamps)
 
     def __iter__(self) -> Iterator[Cycle]:
-        for i, (stamp, pose) in enumerate(zip(self._stamps, self._poses, strict=True)):
-            rows = np.flatnonzero(self._owner == i)
-            if len(rows) > self._options.max_features:
-                most = self._options.max_features
-                rows = rows[np.arange(most) * len(rows) // most]
-            places = (self._points[rows] - pose[:3, 3]) @ pose[:3, :3]
-            colors = None if self._colors is None else self._colors[rows]
-            cycle = Cycle(float(stamp), pose, places, ids=rows.astype(np.uint64), colors=colors)
-            try:
-                cycle = checked(cycle, self.files[1])
-            except RecordingError as error:
-                self.skips.note(error)
-                continue
-            yield cycle
+        yield from kept(range(len(self)), self._cycle, self.skips)
+
+    def _cycle(self, i: int) -> Cycle:
+        pose, rows = self._poses[i], np.flatnonzero(self._owner == i)
+        if len(rows) > self._options.max_features:
+            most = self._options.max_features
+            rows = rows[np.arange(most) * len(rows) // most]
+        places = (self._points[rows] - pose[:3, 3]) @ pose[:3, :3]
+        colors, ids = None if self._colors is None else self._colors[rows], rows.astype(np.uint64)
+        cycle = Cycle(float(self._stamps[i]), pose, places, ids=ids, colors=colors)
+        return checked(cycle, self.files[1])
 
     def _bring_to_camera(self, path: Path) -> tuple[str, ...]:
         """Poses of the body become those of the left camera; what to tell of them."""
@@ -120,16 +118,13 @@ class OrbSlamMap:
         if file.suffix.lower() in READERS:
             return READERS[file.suffix.lower()](file)
         rows: list[list[float]] = []
-        for number, words in read_rows(file):
+        for row in read_rows(file):
             try:
-                rows.append(_place(words))
+                rows.append(_place(row.words))
             except ValueError:
-                names = not rows and all(word.isalpha() for word in words)  # of the columns
+                names = not rows and all(word.isalpha() for word in row.words)  # of the columns
                 if not names:
-                    where = f"{file}, line {number}"
-                    self.skips.note(
-                        RecordingError(f"{where}: `x y z` is wanted, not {shown(words[:3])}")
-                    )
+                    self.skips.note(row.wrong("`x y z` is"))
         return np.array(rows, np.float64).reshape(-1, 3), None
 
 

@@ -82,7 +82,7 @@ def describe(path: Path, options: Options) -> Description:
     try:
         plan = _plan(bag, options)
         source = open(path, options)
-        cycles, notes = len(source), source.notes  # type: ignore[attr-defined]
+        cycles, notes = len(source), source.notes
     except RecordingError as error:
         problem = str(error)
     items = tuple(

@@ -75,6 +75,7 @@ class RtabmapDatabase:
     def __init__(self, path: Path, options: Options) -> None:
         self.name, self._path, self._options = path.stem, path, options
         self.skips = Skips(options.keep_going)
+        self.notes: tuple[str, ...] = ()
         _check_size(path, self.skips)
         with _database(path) as database:
             if options.keep_going:

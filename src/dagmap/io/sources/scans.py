@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -19,21 +20,21 @@ from ...model import Cycle, Floats, RecordingError, Uint8s
 from ..ply import read_vertices
 from ._cloud import doubles, thinned
 from ._kiss import KissIcp
+from ._lists import Row, read_rows, rising
 from ._pcd import read_pcd
 from ._poses import inverse
 from ._source import (
     Description,
     Item,
     Options,
-    Row,
     Skips,
     checked,
+    described,
     folder_name,
+    kept,
     read_bytes,
-    read_rows,
-    rising,
 )
-from ._trajectory import numbers, read_tum
+from ._trajectory import read_tum
 
 UNDERSTANDS = "a folder of clouds (KITTI's .bin, .pcd or .ply; poses.txt)"
 _FOLDERS = ("velodyne", "velodyne_points/data", "clouds", "scans", "pcd", "ply", ".")
@@ -61,11 +62,7 @@ def describe(path: Path, options: Options) -> Description:
     items = (
         Item(str(clouds[0].parent.relative_to(path)), clouds[0].suffix, len(clouds), "clouds"),
     )
-    try:
-        source = open(path, options)
-    except RecordingError as error:
-        return Description(UNDERSTANDS, items, None, str(error))
-    return Description(UNDERSTANDS, items, len(source), None, source.notes)
+    return described(UNDERSTANDS, items, partial(open, path, options))
 
 
 class ScanFolder:
@@ -91,25 +88,24 @@ class ScanFolder:
 
     def __iter__(self) -> Iterator[Cycle]:
         odometry = KissIcp(self._options) if self._poses is None else None
-        for i, (stamp, cloud) in enumerate(zip(self._stamps, self._clouds, strict=True)):
-            try:
-                points, colors = READERS[cloud.suffix.lower()](cloud)
-                pose = self._poses[i] if self._poses is not None else np.eye(4)
-                if odometry is not None:
-                    pose = odometry.register(points, cloud)
-                points, colors = thinned(points, colors, self._options)
-                cycle = checked(Cycle(stamp, pose, points, colors=colors), cloud)
-            except RecordingError as error:
-                self.skips.note(error)
-                continue
-            yield cycle
+
+        def cycle(i: int) -> Cycle:
+            cloud = self._clouds[i]
+            points, colors = READERS[cloud.suffix.lower()](cloud)
+            pose = self._poses[i] if self._poses is not None else np.eye(4)
+            if odometry is not None:
+                pose = odometry.register(points, cloud)
+            points, colors = thinned(points, colors, self._options)
+            return checked(Cycle(self._stamps[i], pose, points, colors=colors), cloud)
+
+        yield from kept(range(len(self)), cycle, self.skips)
 
     def _placed(
         self, file: Path, stamps: list[float] | None, clouds: list[Path]
     ) -> tuple[list[float], list[Path], list[Floats]]:
         """Stamps, clouds and poses where there are all three."""
         rows = read_rows(file)
-        if rows and len(rows[0][1]) == 8:
+        if rows and len(rows[0].words) == 8:
             return self._by_stamp(file, stamps, clouds)
         self._require_mounted(clouds)
         poses = _kitti_poses(file, rows, self._path, self.skips)
@@ -140,14 +136,14 @@ class ScanFolder:
                 "their stamps in s (1305031102.175304.pcd), or write times.txt, a stamp a line"
             )
         found = [(s, c, trajectory.at(s)) for s, c in zip(stamps, clouds, strict=True)]
-        kept = [(s, c, pose) for s, c, pose in found if pose is not None]
-        self.dropped = len(clouds) - len(kept)
-        if not kept:
+        placed = [(s, c, pose) for s, c, pose in found if pose is not None]
+        self.dropped = len(clouds) - len(placed)
+        if not placed:
             raise RecordingError(
                 f"{file}: none of {len(clouds)} clouds has a pose for its moment; check that both "
                 "use the same clock"
             )
-        return [s for s, _, _ in kept], [c for _, c, _ in kept], [p for _, _, p in kept]
+        return [s for s, _, _ in placed], [c for _, c, _ in placed], [p for _, _, p in placed]
 
 
 def _clouds(path: Path) -> list[Path]:
@@ -176,13 +172,13 @@ def _stamps(path: Path, clouds: list[Path], skips: Skips) -> tuple[list[float] |
     clouds that have one."""
     file = path / "times.txt"
     if file.is_file():
-        stamps = _in_order(read_rows(file), lambda row: numbers(file, *row, 1)[0], skips)
+        stamps = _in_order(read_rows(file), lambda row: row.numbers(1)[0], skips)
         pairs = _aligned(file, "stamps", len(stamps), clouds, skips)
         rows = ((stamps[i], f"{file}, stamp {i + 1}", (stamps[i], cloud)) for cloud, i in pairs)
-        kept = rising(rows, skips)
-        if not kept:
+        found = rising(rows, skips)
+        if not found:
             raise RecordingError(f"{file}: no stamps; one a line is wanted, or remove the file")
-        return [stamp for stamp, _ in kept], [cloud for _, cloud in kept]
+        return [stamp for stamp, _ in found], [cloud for _, cloud in found]
     if all(re.fullmatch(r"\d+\.\d+", cloud.stem) for cloud in clouds):
         return [float(cloud.stem) for cloud in clouds], clouds
     return None, clouds
@@ -223,7 +219,7 @@ def _kitti_poses(file: Path, rows: list[Row], path: Path, skips: Skips) -> list[
     """(4, 4) each: of the LiDAR, where calib.txt says how it is mounted to KITTI's camera."""
     poses = []
     mounted = _calibration(path / "calib.txt")
-    for values in _in_order(rows, lambda row: numbers(file, *row, 12), skips):
+    for values in _in_order(rows, lambda row: row.numbers(12), skips):
         pose = np.eye(4)
         pose[:3] = np.reshape(values, (3, 4))
         with np.errstate(over="ignore", invalid="ignore"):  # what is no pose is refused later
@@ -238,9 +234,9 @@ def _calibration(file: Path) -> Floats:
     out = np.eye(4)
     if not file.is_file():
         return out
-    for number, words in read_rows(file):
-        if words[0] in ("Tr:", "Tr_velo_to_cam:"):
-            out[:3] = np.reshape(numbers(file, number, words[1:], 12), (3, 4))
+    for row in read_rows(file):
+        if row.words[0] in ("Tr:", "Tr_velo_to_cam:"):
+            out[:3] = np.reshape(row.numbers(12, first=1), (3, 4))
             return out
     raise RecordingError(
         f"{file}: no line `Tr:`, from the LiDAR to the camera; add it, or remove it"

@@ -13,20 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from ...model import Cycle, Floats, RecordingError
+from ._lists import Row, read_rows, rising, stamped_files
 from ._odometry import PictureOdometry
-from ._poses import SLACK, matrix, nearest
+from ._poses import SLACK, nearest
 from ._rgbd import FrontEnd, import_cv2, load_camera
-from ._source import (
-    Options,
-    Row,
-    Skips,
-    checked,
-    folder_name,
-    read_rows,
-    readable,
-    rising,
-    shown,
-)
+from ._source import Options, Skips, checked, folder_name, kept
+from ._trajectory import stamped_pose
 
 UNDERSTANDS = "a TUM RGB-D folder (rgb/, depth/, camera.json, groundtruth.txt)"
 _PARTS = ("rgb", "depth", "groundtruth.txt", "associations.txt", "rgb.txt", "depth.txt")
@@ -85,20 +77,19 @@ class TumFolder:
     def __iter__(self) -> Iterator[Cycle]:
         front = FrontEnd(self._cv2, self._camera, self._options)
         odometry = PictureOdometry(self._cv2, self._camera)
-        for frame, pose in self._placed:
-            try:
-                picture, metres = front.read(frame.color, frame.depth)
-                pose = odometry.register(picture, metres) if pose is None else pose
-                points, colors, described = front.of(picture, metres)
-                session = max(odometry.session, 0)
-                cycle = Cycle(
-                    frame.stamp, pose, points, colors=colors, session=session, descriptors=described
-                )
-                cycle = checked(cycle, self._path)
-            except RecordingError as error:
-                self.skips.note(error)
-                continue
-            yield cycle
+
+        def cycle(placed: tuple[_Frame, Floats | None]) -> Cycle:
+            frame, pose = placed
+            picture, metres = front.read(frame.color, frame.depth)
+            pose = odometry.register(picture, metres) if pose is None else pose
+            points, colors, described = front.of(picture, metres)
+            session = max(odometry.session, 0)
+            found = Cycle(
+                frame.stamp, pose, points, colors=colors, session=session, descriptors=described
+            )
+            return checked(found, self._path)
+
+        yield from kept(self._placed, cycle, self.skips)
 
     def _with_poses(self, frames: list[_Frame], file: Path) -> list[tuple[_Frame, Floats | None]]:
         """The frames that have a pose; without a file of poses all, to be found by odometry."""
@@ -144,54 +135,32 @@ def _associated(path: Path, file: Path, skips: Skips) -> list[_Frame]:
     """The frames that associations.txt names: stamp, rgb, stamp, depth."""
 
     def frame(row: Row) -> _Frame:
-        number, words = row
-        line = f"{file}, line {number}"
-        if len(words) != 4:
-            raise RecordingError(f"{line}: `stamp rgb stamp depth` is wanted, not {shown(words)}")
-        _number(words[0], line)
-        return _Frame(_number(words[2], line), path / words[1], path / words[3], line)
+        if len(row.words) != 4:
+            raise row.wrong("`stamp rgb stamp depth` is")
+        color, depth = (path / name for name in row.words[1::2])
+        _number(row.words[0], row.where)
+        return _Frame(_number(row.words[2], row.where), color, depth, row.where)
 
-    frames = readable(read_rows(file), frame, skips)
+    frames = kept(read_rows(file), frame, skips)
     return rising(((frame.stamp, frame.line, frame) for frame in frames), skips)
 
 
 def _matched(path: Path, skips: Skips) -> list[_Frame]:
     """Each depth picture with the nearest colour picture, if each is the other's nearest."""
-    colors, depths = _list(path, "rgb", skips), _list(path, "depth", skips)
+    colors, depths = (
+        stamped_files(path / f"{part}.txt", "`stamp file`", path, path / part, _number, skips)
+        for part in ("rgb", "depth")
+    )
     if not colors or not depths:
         return []
-    color_stamps = np.array([stamp for stamp, _ in colors])
-    depth_stamps = np.array([stamp for stamp, _ in depths])
+    color_stamps = np.array([color.stamp for color in colors])
+    depth_stamps = np.array([depth.stamp for depth in depths])
     frames = []
-    for (stamp, depth), i in zip(depths, nearest(color_stamps, depth_stamps), strict=True):
+    for depth, i in zip(depths, nearest(color_stamps, depth_stamps), strict=True):
         back = nearest(depth_stamps, color_stamps[i : i + 1])[0]
-        if abs(colors[i][0] - stamp) <= SLACK and depths[back][1] == depth:
-            frames.append(_Frame(stamp, colors[i][1], depth))
+        if abs(colors[i].stamp - depth.stamp) <= SLACK and depths[back] == depth:
+            frames.append(_Frame(depth.stamp, colors[i].file, depth.file))
     return frames
-
-
-def _list(path: Path, part: str, skips: Skips) -> list[tuple[float, Path]]:
-    """(stamp, picture) from rgb.txt or depth.txt, else from the names of the files."""
-    file = path / f"{part}.txt"
-
-    def named(row: Row) -> tuple[float, str, tuple[float, Path]]:
-        number, words = row
-        line = f"{file}, line {number}"
-        if len(words) != 2:
-            raise RecordingError(f"{line}: `stamp file` is wanted, not {shown(words)}")
-        stamp = _number(words[0], line)
-        return stamp, line, (stamp, path / words[1])
-
-    if file.exists():
-        return rising(readable(read_rows(file), named, skips), skips)
-    remedy = f"name files by their stamp, or write {part}.txt or associations.txt"
-
-    def by_name(picture: Path) -> tuple[float, Path]:
-        return _number(picture.stem, f"{picture} ({remedy})"), picture
-
-    files = (f for f in (path / part).iterdir() if f.is_file() and not f.name.startswith("."))
-    pictures = sorted(readable(files, by_name, skips))
-    return rising(((stamp, str(file), (stamp, file)) for stamp, file in pictures), skips)
 
 
 def _placed(frames: list[_Frame], file: Path, skips: Skips) -> list[tuple[_Frame, Floats | None]]:
@@ -207,31 +176,15 @@ def _placed(frames: list[_Frame], file: Path, skips: Skips) -> list[tuple[_Frame
 
 def _trajectory(file: Path, skips: Skips) -> tuple[Floats, Floats]:
     """Stamps (M,) and poses (M, 4, 4) of groundtruth.txt: stamp tx ty tz qx qy qz qw."""
-    wanted = "`stamp tx ty tz qx qy qz qw` is wanted"
 
     def placed(row: Row) -> tuple[float, str, tuple[float, Floats]]:
-        number, words = row
-        line = f"{file}, line {number}"
-        if len(words) != 8:
-            raise RecordingError(f"{line}: {wanted}, not {shown(words)}")
-        stamp, *values = (_number(word, line) for word in words)
-        return stamp, line, (stamp, _pose(values, line))
+        stamp, pose = stamped_pose(row)
+        return stamp, row.where, (stamp, pose)
 
-    rows = rising(readable(read_rows(file), placed, skips), skips)
+    rows = rising(kept(read_rows(file), placed, skips), skips)
     if not rows:
         raise RecordingError(f"{file}: no poses; a line `stamp tx ty tz qx qy qz qw` each")
     return np.array([stamp for stamp, _ in rows]), np.array([pose for _, pose in rows])
-
-
-def _pose(values: list[float], line: str) -> Floats:
-    """(4, 4) from translation and quaternion."""
-    quaternion = np.array(values[3:])
-    pose = matrix(np.array(values[:3]), quaternion)
-    if pose is None:
-        with np.errstate(over="ignore"):  # to infinity, which is refused
-            length = float(np.linalg.norm(quaternion))
-        raise RecordingError(f"{line}: a quaternion of length {length:.3g}; 1 is wanted")
-    return pose
 
 
 def _number(word: str, line: str) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from ..export import atomic_write
 from ..exported import MapTable
 from ._writer import WriteOptions, library
-from .pcd import packed_rgb
+from .pcd import point_rows
 
 SUFFIXES = (".mcap",)
 ABOUT = "MCAP, ROS 2: PointCloud2 on /dagmap/map"
@@ -49,19 +49,11 @@ def _stamp(table: MapTable) -> int:
 def cloud_message(types: Any, table: MapTable, stamp: int) -> Any:
     """The table as a PointCloud2 of the type store. stamp: ns."""
     of = types.types
-    kinds: list[tuple[str, Any]] = [(axis, np.dtype("<f4")) for axis in "xyz"]
-    kinds += [("rgb", np.dtype("<f4"))]
-    kinds += [(name, column.dtype) for name, column in table.fields.items()]
-    rows = np.zeros(len(table), np.dtype(kinds))
-    for i, axis in enumerate("xyz"):
-        rows[axis] = table.positions[:, i]
-    rows["rgb"] = packed_rgb(table)
-    for name, column in table.fields.items():
-        rows[name] = column
+    rows = point_rows(table)
     places: Any = rows.dtype.fields
     fields = [
-        of["sensor_msgs/msg/PointField"](name, int(places[name][1]), _CODES[kind.str[1:]], 1)
-        for name, kind in kinds
+        of["sensor_msgs/msg/PointField"](name, int(offset), _CODES[kind.str[1:]], 1)
+        for name, (kind, offset) in places.items()
     ]
     time = of["builtin_interfaces/msg/Time"](stamp // 10**9, stamp % 10**9)
     return of[_TYPE](

@@ -1,0 +1,43 @@
+"""bench/reliability.py: what was measured is kept with how it was made."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+def module(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, ROOT / "bench" / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    made = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(made)
+    return made
+
+
+def test_a_part_is_measured_once_for_each_question_and_each_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keeping, file, done = module("keeping"), tmp_path / "new" / "part.json", []
+
+    def part() -> list[int]:
+        done.append(len(done))
+        return done
+
+    first = keeping.kept(file, {"seeds": 5}, part)
+    assert first["figures"] == [0] and first["asked"]["seeds"] == 5
+    assert first["made"]["cores"] >= 1 and len(first["made"]["spent"]) == 2
+    assert keeping.kept(file, {"seeds": 5}, part) == first
+    assert keeping.kept(file, {"seeds": 6}, part)["figures"] == [0, 1]
+    monkeypatch.setattr(keeping, "_code", lambda: "another")
+    again = keeping.kept(file, {"seeds": 6}, part)
+    assert again["figures"] == [0, 1, 2] and again["asked"]["code"] == "another"
+
+
+def test_a_part_may_say_itself_what_it_took(tmp_path: Path) -> None:
+    held = module("keeping").kept(tmp_path / "a.json", {}, lambda: {"spent": [3.0, 2.0], "x": 1})
+    assert held["made"]["spent"] == [3.0, 2.0] and held["figures"] == {"x": 1}
