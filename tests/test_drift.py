@@ -22,7 +22,7 @@ Points = np.ndarray
 START = pose(3, -2, 1, 2.0)
 FOLLOWING = PlacingConfig(units_per_tick=400, keyframe_distance=0.2, drift=0.03)
 CONFIG = msgspec.structs.replace(QUICK, start_pose=None, placing=FOLLOWING)
-CYCLES = 18
+CYCLES = 24
 OFF = 0.015  # m to the side per cycle, of half a metre: 3 %
 
 
