@@ -257,11 +257,12 @@ def test_what_cannot_be_told_is_not_placed(name: str) -> None:
 
 def test_it_is_told_why() -> None:
     told = {}
-    for name in ("no overlap", "a single wall", "two equal rooms"):
+    for name in ("no overlap", "only noise", "a single wall", "two equal rooms"):
         ann, bob = NOT_PLACED[name]()
         told[name] = set(meet(ann=ann, bob=bob)["bob"].unplaced.values())
     assert told == {
         "no overlap": {"nothing in common was seen yet"},
+        "only noise": {"nothing in common was seen yet"},
         "a single wall": {"the points that agree lie in one plane or line"},
         "two equal rooms": {"the maps fit in more than one way"},
     }

@@ -71,7 +71,7 @@ class Agent:
         self.consensus = Consensus(self.config, identity.salt)
         self.observing = Observing(self.config, identity.author, identity.salt)
         self.sync = Sync(self.ledger, self.config, identity.author)
-        self.placing = Placing(self.config, identity.author)
+        self.placing = Placing(self.config, identity.author, self.observing.drift)
         self.steering = Steering(self.config, identity.author)
         self.listening = False  # to be told of its own chain first: nothing is issued meanwhile
         self._map: WorldMap | None = None
@@ -226,10 +226,10 @@ class Agent:
         return self._map
 
     def frame(self) -> Floats | None:
-        """(4, 4) pose of the robot's SLAM frame in the fleet frame; None while not placed."""
+        """(4, 4) m, the SLAM frame in the fleet frame, as it drifts by now; None: not placed."""
         self._catch_up()
         placed = self.consensus.frames.get(FrameId(*self._frame))
-        return None if placed is None else pose_matrix(placed[1])
+        return None if placed is None else pose_matrix(placed[1]) @ self.observing.drift.now
 
     @property
     def robots(self) -> dict[str, tuple[Floats, float]]:

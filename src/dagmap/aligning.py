@@ -16,7 +16,7 @@ import numpy as np
 
 from .kernels.voxels import SHIFT, nearest_facing, tally
 from .model import Floats, Int64s
-from .registration import SHARED, Working, carry, inverse
+from .registration import SHARED, Working, carry, inverse, small
 from .surfels import FACING, FREE, Surfels, facing, kinds_of
 
 SAMPLE = 256  # surfels that shifts are tried with
@@ -304,19 +304,7 @@ def _step(points: Floats, normals: Floats, away: Floats) -> Floats:
     scale = np.array([_TURNED] * 3 + [1.0] * 3)
     jacobian = np.concatenate([np.cross(points - centre, normals), normals], axis=1) * scale
     damped = jacobian.T @ jacobian + _DAMPING * len(points) * np.eye(6)
-    return _small(scale * np.linalg.solve(damped, jacobian.T @ away), centre)
-
-
-def _small(change: Floats, centre: Floats) -> Floats:
-    """(4, 4) of a turn (3,) about a place, and a shift (3,)."""
-    angle = float(np.linalg.norm(change[:3]))
-    out = np.eye(4)
-    if angle > 1e-12:
-        x, y, z = change[:3] / angle
-        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        out[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-    out[:3, 3] = centre - out[:3, :3] @ centre + change[3:]
-    return out
+    return small(scale * np.linalg.solve(damped, jacobian.T @ away), centre)
 
 
 def judge(source: Surfels, target: Surfels, pose: Floats) -> Working[Agreement]:

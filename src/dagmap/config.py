@@ -235,6 +235,10 @@ class PlacingConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
     # Whether frames without descriptors are placed by their shape. Rooms that are alike to the
     # centimetre, each seen by one robot only, would be laid on each other: so it is to be wanted.
     surfaces: bool = False
+    # m that this robot's SLAM drifts per m and does not correct: 0.01 to 0.02 for an odometry. Then
+    # its path is bent to what others, placed already, have seen. 0: it is not, for what others show
+    # could bend a path that is right; so leave it where the SLAM closes its loops.
+    drift: float = 0.0
     # Work of a tick: comparing two keyframes of 200 points is two units, half a ms together. So a
     # tick stays under 10 ms, a fifth of what a SLAM can spare; a piece of work ends later at most.
     units_per_tick: int = 24
@@ -246,6 +250,7 @@ class PlacingConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
         self._require_range("keyframe_distance", 0.01, 1000.0)
         self._require_range("keyframe_turn", 1.0, 180.0)
         self._require_range("inliers", 12, 1 << 20)
+        self._require_range("drift", 0.0, 0.1)
         self._require_range("units_per_tick", 1, 10_000)
 
     @property

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from .backlog import Backlog, Seen
 from .config import Config
+from .drift import Drift
 from .graph import AdjacencyDag
 from .issuance import ROOM, Allowance, Issuance, Known
 from .kernels.codec import morton_order
@@ -57,6 +58,7 @@ class Observing:
         self._retracted: list[Int64s] = []
         self._links: list[Link] = []
         self._keyframes = Keyframes(config.placing)
+        self.drift = Drift(config.placing)
         self._introduced = config.closed  # there the certificate names the robot
         self._earlier: list[Issuance] = []  # of former sessions, with features held back
         self.backlog = Backlog(config.overhead.backlog)
@@ -118,10 +120,14 @@ class Observing:
         if len(cycle.removed):
             self._arrangement.remove(cycle.removed)
         moved = [Anchor(self._cycle_of[s], self.session, s, pose) for s, pose in cycle.moved]
-        for anchor in moved:
+        self._lay(self.drift.follow(moved))
+
+    def _lay(self, anchors: list[Anchor]) -> None:
+        """Earlier cycles lie elsewhere from now on."""
+        for anchor in anchors:
             self.backlog.move(anchor.cycle, anchor.pose)
             self._arrangement.move(anchor.cycle, anchor.pose)
-        self._moved += moved
+        self._moved += anchors
 
     def rearrange(self, limit: int = REARRANGED) -> None:
         """Do in the DAG what `withdraw` took, for about so many units (see `rearranging`)."""
@@ -140,7 +146,9 @@ class Observing:
         number, self.cycles = self.cycles, self.cycles + 1
         self._sessions[cycle.session] = cycle.stamp
         self._cycle_of[cycle.stamp] = number
-        self._publish(Anchor(number, cycle.session, cycle.stamp, cycle.pose), now)
+        anchor = self.drift.enter(Anchor(number, cycle.session, cycle.stamp, cycle.pose))
+        cycle = replace(cycle, pose=anchor.pose)
+        self._publish(anchor, now)
         self.issuance.begin(now)
         self.observed += len(cycle.points)
         self._keyframes.see(number, cycle)
@@ -185,8 +193,10 @@ class Observing:
         return max(int(self._arrangement.nodes(np.array([id_], np.uint64))[0]), -1)
 
     def relate(self, links: Iterable[Link], wanted: bool) -> None:
-        """Publish links of the robot's own frames; and its described points, where `wanted`."""
+        """Publish links of the robot's own frames, and what is known of its drift; and its
+        described points, where `wanted`."""
         self._links.extend(links)
+        self._lay(self.drift.take())
         self._keyframes.wanted = wanted
 
     @property
@@ -263,6 +273,7 @@ class Observing:
             self._start_frame()
         self.session = session
         self._keyframes.start()
+        self.drift.start(session)
         if session in self._sessions:
             return
         here = FrameId(self._author, session)

@@ -13,8 +13,10 @@ contradict each other and are both believable are an ambiguity: then none is pub
 
 from __future__ import annotations
 
+from .bending import Bending
 from .config import Config
 from .consensus import Consensus
+from .drift import Drift
 from .frames import Placed
 from .keyframes import Keyframe
 from .ledger import Ledger
@@ -30,13 +32,15 @@ DESCRIBED = 2  # keyframes with descriptors: with fewer of them a frame is place
 class Placing:
     """One robot's search for the frames of others. `step` a little in every tick."""
 
-    def __init__(self, config: Config, me: AuthorId) -> None:
+    def __init__(self, config: Config, me: AuthorId, drift: Drift | None = None) -> None:
         self._config, self._me = config.placing, me
         self._read: dict[AuthorId, int] = {}  # transactions of each chain that were looked at
         self._waiting: dict[AuthorId, list[Described]] = {}  # their anchors are not known yet
         self._keyframes: dict[FrameId, list[Keyframe]] = {}
         self._relations: dict[tuple[FrameId, FrameId], Likeness] = {}
         self._surfaces = Surfaces(config, me)
+        self._bending = Bending(config.placing, me, drift or Drift(config.placing))
+        self._moves = 0  # of keyframes, by so much that they are to be looked at anew
         self._turn = 0
         self.spent = 0  # units of work of the last step
 
@@ -47,6 +51,9 @@ class Placing:
         if not strange and not self._keyframes and not self._surfaces.shapes:
             return [], False  # everybody shares one frame
         self._take_in(ledger, consensus)
+        # first, since drift that is left would look like another way to place the frame
+        share = self._config.units_per_tick // 2
+        self.spent += self._bending.step(self._keyframes, consensus, self._moves, share)
         links = self._search(consensus)
         if self._config.surfaces:
             links += self._look_at_surfaces(ledger, consensus)
@@ -173,6 +180,7 @@ class Placing:
                 if anchor is not None and anchor.pose is not keyframe.pose:
                     keyframe.move(anchor.pose)
                     far |= keyframe.went_beyond(self._config.tolerance_mm / 2)
+            self._moves += far
             for relation in self._relations.values() if far else ():
                 if frame in (relation.source, relation.target):
                     relation.judge_anew()

@@ -145,6 +145,18 @@ def refine(
     return (pose, inliers) if inliers.sum() >= 3 else None
 
 
+def small(change: Floats, centre: Floats) -> Floats:
+    """(4, 4) of a turn (3,) rad about a place, and a shift (3,)."""
+    angle = float(np.linalg.norm(change[:3]))
+    out = np.eye(4)
+    if angle > 1e-12:
+        x, y, z = change[:3] / angle
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        out[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    out[:3, 3] = centre - out[:3, :3] @ centre + change[3:]
+    return out
+
+
 def residuals(pose: Floats, source: Floats, target: Floats) -> Floats:
     """(N,) how far a pose leaves the points from their targets."""
     return np.asarray(np.linalg.norm(carry(pose, source) - target, axis=-1))
@@ -264,10 +276,10 @@ def _seen(
     here: Views, there: Views, pose: Floats, tolerance: float, wide: bool
 ) -> Working[tuple[list[tuple[int, int]], Floats, Floats, list[int]]]:
     """Keyframes that face each other, their points that look alike (N, 3), and how many of each."""
-    pairs = _facing(here, there, pose)
+    pairs = facing(here, there, pose)
     found = [(np.zeros((0, 3)), np.zeros((0, 3)))]
     for i, j in pairs:
-        found.append(_agreeing(here, there, i, j, pose, tolerance, wide))
+        found.append(agreeing(here, there, i, j, pose, tolerance, wide))
         yield compared(here.descriptors[i], there.descriptors[j])
     sizes = [len(source) for source, _ in found[1:]]
     source, target = (np.concatenate([pair[k] for pair in found]) for k in range(2))
@@ -297,7 +309,7 @@ def rivals(here: Views, there: Views, found: Evidence, tolerance: float) -> Work
     return out
 
 
-def _facing(here: Views, there: Views, pose: Floats) -> list[tuple[int, int]]:
+def facing(here: Views, there: Views, pose: Floats) -> list[tuple[int, int]]:
     """Pairs of keyframes that should show the same, by place and direction; the nearest first."""
     places = carry(pose, here.poses[:, :3, 3])
     away = np.linalg.norm(places[:, None] - there.poses[None, :, :3, 3], axis=2)
@@ -309,7 +321,7 @@ def _facing(here: Views, there: Views, pose: Floats) -> list[tuple[int, int]]:
     return [(int(i) // len(there.poses), int(i) % len(there.poses)) for i in order]
 
 
-def _agreeing(
+def agreeing(
     here: Views, there: Views, i: int, j: int, pose: Floats, tolerance: float, wide: bool
 ) -> tuple[Floats, Floats]:
     """Points of two keyframes that look alike and come to lie together."""
