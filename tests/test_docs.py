@@ -135,7 +135,7 @@ def test_every_option_that_a_page_names_exists() -> None:
         command = stack.pop()
         known |= {option for one in command.params for option in (*one.opts, *one.secondary_opts)}
         stack += getattr(command, "commands", {}).values()
-    others = {"--runs"}  # of bench/reliability.py
+    others = {"--runs", "--seconds", "--scenes"}  # of programs in bench
     for page in PAGES:
         if page.name in ("fuzzing.md", "quality.md", "install.md", "experiments.md"):
             continue
