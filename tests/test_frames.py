@@ -72,7 +72,7 @@ def test_the_tree_takes_the_best_links() -> None:
 
 
 @given(st.randoms(use_true_random=False))
-@settings(max_examples=30)
+@settings(max_examples=30, deadline=None)
 def test_the_order_of_links_does_not_matter(rng: random.Random) -> None:
     frames = [FrameId(bytes([n]) * 8) for n in range(6)]
     links = [

@@ -7,11 +7,11 @@ import threading
 import numpy as np
 import pytest
 
-import dagmap.agent
 from dagmap import Accepted, Config, Cycle
 from dagmap.io.queues import Inbox, Question, Rates, SendQueue
 from dagmap.messages import Heads, Kind, Parsers, Transactions, Want, encode, kind_of
-from dagmap.model import Outgoing
+from dagmap.model import Outgoing, TransactionId
+from dagmap.transaction import worked
 from scene import agent as scene_agent
 from scene import cycles
 
@@ -219,11 +219,14 @@ def test_a_replay_costs_one_look_up(monkeypatch: pytest.MonkeyPatch) -> None:
     first = [event for data in said for event in listener.receive(data, 0.0)]
     assert sum(isinstance(event, Accepted) for event in first) == len(speaker.ledger) > 3
     hashed: list[bytes] = []
-    real = dagmap.agent.id_of
-    monkeypatch.setattr(dagmap.agent, "id_of", lambda data: hashed.append(data) or real(data))
+
+    def counted(data: bytes, config: Config) -> TransactionId:
+        hashed.append(data)
+        return worked(data, config)
+
     for name in ("add", "worth_judging"):
         monkeypatch.setattr(listener.ledger, name, None)
-    listener._parsers = Parsers(transaction=None)  # type: ignore[arg-type]  # not to be called
+    listener._parsers = Parsers(worked=counted, transaction=None)  # type: ignore[arg-type]  # not to be called
     before = listener.digest()
     for _ in range(10):
         assert not [event for data in said for event in listener.receive(data, 1.0)]
