@@ -52,9 +52,10 @@ def _spent() -> tuple[float, float]:
 
 @cache
 def _code() -> str:
-    """Eight digits that change with the code and the scenarios."""
+    """Eight digits that change with the code, the scenarios and what is measured of them."""
     paths = [*(ROOT / "src" / "dagmap").rglob("*.py"), *(ROOT / "scenarios").glob("*.toml")]
     digest = hashlib.blake2b(digest_size=4)
-    for path in sorted(paths):
-        digest.update(path.read_bytes())
+    for path in sorted([*paths, ROOT / "bench" / "reliability.py"]):
+        content = path.read_bytes()
+        digest.update(f"{path.relative_to(ROOT).as_posix()} {len(content)}\n".encode() + content)
     return digest.hexdigest()

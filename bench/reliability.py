@@ -208,7 +208,7 @@ def swept(options: argparse.Namespace, tell: Callable[[float], None]) -> dict[st
         "spent": spent,
         "scenarios": [path.stem for path in paths],
         "seeds_each": each,
-        "runs": each * len(paths),
+        "runs": seeds.stop * len(paths),
         "failure": failure,
     }
 
@@ -370,12 +370,14 @@ def main() -> None:
             progress.update(tasks[what], completed=share)
 
         parts = measure(options, tell, before)
+    hundred = load_scenario(ROOT / "scenarios" / "hundred.toml")
     settings = {
         "fleet": FLEET,
         "mission": SMALL.seconds,
         "points": SMALL.sensor.points,
         "period": SMALL.config.sync.announce_period,
         "trouble_loss": TROUBLED.link.loss,
+        "fold_period": hundred.config.ledger.fold_period,
     }
     write({"parts": parts, "settings": settings, "fuzz_executions": fuzzed()}, options.out)
     failure = parts["sweep"]["figures"]["failure"]

@@ -132,7 +132,7 @@ def text(figures: dict[str, Any]) -> str:
     sweep, hour = parts["sweep"], parts["hour"]
     return TEXT.format(
         sweep=_sweep(sweep),
-        hundred=_hundred(parts["hundred"]),
+        hundred=_hundred(parts["hundred"], figures["settings"]["fold_period"]),
         hour_for=f"{hour['mission_s']:,.0f} s",
         hour=_hour(hour),
         busy=_busy(parts["busy"]),
@@ -182,13 +182,14 @@ def _sweep(sweep: dict[str, Any]) -> str:
     return f"{sweep['runs']:,} runs without a violation"
 
 
-def _hundred(run: dict[str, Any]) -> str:
+def _hundred(run: dict[str, Any], fold_period: float) -> str:
     over = run["bytes_carried"] / max(1, run["bytes_minimum"])
     missed = "**" if run["wall_s"] > WANTED["hundred"] else ""
     return (
         f"{run['robots']} robots, {run['mission_s']:,.0f} s: {_agreement_of(run)} of the last of "
         f"{run['transactions']:,} transactions; {run['messages']:,} messages "
-        f"({run['messages_per_s']:,.0f} a second), {over:.1f} times the least bytes. Wall time "
+        f"({run['messages_per_s']:,.0f} a second), {over:.1f} times the least bytes; maps are "
+        f"folded every {fold_period:g} s. Wall time "
         f"{missed}{run['wall_s']:,.0f} s{missed}, processor time {run['processor_s']:,.0f} s "
         f"(wanted: {WANTED['hundred']} s at most)"
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -15,10 +16,10 @@ from dagmap.consensus import Consensus
 from dagmap.contribution import Author
 from dagmap.kernels import lattice
 from dagmap.ledger import Ledger
-from dagmap.messages import Heads
+from dagmap.messages import Heads, Parsers
 from dagmap.model import Int32s
 from dagmap.overhead import Controller
-from dagmap.sim import liars
+from dagmap.sim import fleet, liars
 from dagmap.sim import sweep as sweep_module
 from dagmap.sim.fleet import Crash
 from dagmap.sim.invariants import Invariants
@@ -44,6 +45,22 @@ def test_no_promise_is_broken(name: str) -> None:
     assert failure is None, failure
     failure = attempt(scenario(name), 9005, invariants=Invariants(changes=1))
     assert failure is None, failure
+
+
+def test_what_robots_of_one_process_share_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Real robots forget decoded features and decode them again where poses move."""
+    moving = msgspec.structs.replace(scenario("loops"), seconds=12.0)
+    together = timeline_of(moving, 1)
+    alone = SimpleNamespace(parsers=Parsers())
+    monkeypatch.setattr(fleet, "SharedParsers", lambda: alone)
+    decoded, again = [], transaction.Transaction.decode_again
+    monkeypatch.setattr(
+        transaction.Transaction,
+        "decode_again",
+        lambda self, config: decoded.append(self.payload.bundle) or again(self, config),
+    )
+    assert timeline_of(moving, 1) == together
+    assert decoded.count(None) >= 10, "some were read again"
 
 
 def test_the_controller_raises_n_c_under_the_invariants() -> None:

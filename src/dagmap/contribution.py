@@ -186,7 +186,7 @@ class Contribution:
         if self.fresh:
             self.fresh = False
             return self.xyz
-        held = self.transaction.payload.bundle
+        held = self.transaction.payload.bundle  # only where agents of one process share it
         bundle = held or self.transaction.decode_again(config).bundle
         return self.xyz if bundle is None else bundle.position
 

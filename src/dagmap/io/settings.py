@@ -122,7 +122,8 @@ def is_endpoint(text: str) -> bool:
     if protocol not in ("tcp", "udp", "tls", "quic", "ws"):
         return bool(protocol and address)
     host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
-    return bool(host) and port.isascii() and port.isdigit() and int(port) < 1 << 16
+    short = port.isascii() and port.isdigit() and len(port) <= 5
+    return bool(host) and short and int(port) < 1 << 16
 
 
 class StoreConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):

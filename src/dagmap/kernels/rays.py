@@ -7,6 +7,8 @@ The walk (Amanatides and Woo, 1987) compares the times of the next crossings t =
 axes after multiplication by all three |d|: exact. An axis that climbs enters the next cell when it
 reaches the border, one that falls when it leaves it, hence at equal times climbing axes go first;
 among equals x, then y, then z. Each crossing is a step: a ray through an edge marks a cell beside.
+
+`bricks.walk` calls this: after a change here, `make clean-cache` (see `jit`).
 """
 
 from __future__ import annotations
