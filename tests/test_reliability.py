@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 from pathlib import Path
 from types import ModuleType
 
@@ -41,3 +42,19 @@ def test_a_part_is_measured_once_for_each_question_and_each_code(
 def test_a_part_may_say_itself_what_it_took(tmp_path: Path) -> None:
     held = module("keeping").kept(tmp_path / "a.json", {}, lambda: {"spent": [3.0, 2.0], "x": 1})
     assert held["made"]["spent"] == [3.0, 2.0] and held["figures"] == {"x": 1}
+
+
+PAGE = ROOT / "docs" / "reliability.md"
+
+
+def test_the_page_is_written_from_its_figures_alone() -> None:
+    """Nobody edits a figure, or the words around it: they are in bench/reliability_text.py."""
+    figures = json.loads(PAGE.with_suffix(".json").read_text())
+    remedy = "python bench/reliability.py text"
+    assert module("reliability_text").text(figures) == PAGE.read_text(), remedy
+
+
+def test_the_page_has_the_executions_of_the_page_about_fuzzing() -> None:
+    figures = json.loads(PAGE.with_suffix(".json").read_text())
+    fuzzing = (ROOT / "docs" / "fuzzing.md").read_text()
+    assert f"In all {figures['fuzz_executions']:,} coverage-guided" in fuzzing
