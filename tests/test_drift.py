@@ -150,6 +150,33 @@ def test_a_slam_that_corrects_itself_is_followed_and_what_was_found_is_void() ->
     assert drift.enter(anchor(3, 3.0)).pose[5] == 0 and np.array_equal(drift.now, np.eye(4))
 
 
+def test_a_long_way_is_carried_a_little_in_every_tick() -> None:
+    """An hour's cycles in one tick would take seconds."""
+    drift = Drift(FOLLOWING)
+    for cycle in range(1000):
+        drift.enter(anchor(cycle, 0.01 * cycle))
+    drift.bend([Bend(0, shifted(40.0))])
+    taken = drift.take()
+    assert 0 < len(taken) <= 100
+    assert drift.enter(anchor(1000, 10.0)).pose[5] == 40, "what is new is right at once"
+    while more := drift.take():
+        assert len(more) <= 100
+        taken += more
+    assert [anchor.cycle for anchor in taken] == list(range(1000))
+    assert {anchor.pose[5] for anchor in taken} == {40}
+
+
+def test_a_correction_under_way_ends_where_the_slam_corrects_itself() -> None:
+    drift = Drift(FOLLOWING)
+    for cycle in range(300):
+        drift.enter(anchor(cycle, 0.01 * cycle))
+    drift.bend([Bend(0, shifted(40.0))])
+    moved = {anchor.cycle for anchor in drift.take()}
+    back = drift.follow([anchor(299, 5.0)])
+    assert {anchor.cycle for anchor in back} == moved | {299}
+    assert {anchor.pose[5] for anchor in back} == {0} and drift.take() == []
+
+
 def path(count: int = 8) -> Path:
     said = np.array([np.eye(4)] * count)
     said[:, 0, 3] = 500.0 * np.arange(count)

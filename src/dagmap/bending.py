@@ -163,7 +163,8 @@ class Bending:
             carry(pose, keyframe.described.position.astype(np.float64))
             for pose, (keyframe, _) in zip(poses, known, strict=True)
         ]
-        depth = float(np.median([keyframe.depth for keyframe, _ in known]))
+        # points at the sensor itself would leave nothing that resists a turn
+        depth = max(1.0, float(np.median([keyframe.depth for keyframe, _ in known])))
         views = Views(poses, points, [keyframe.descriptors for keyframe, _ in known], depth)
         return Path(cycles, said, motions, views)
 

@@ -7,6 +7,7 @@ them is carried by both, by how near it is to each; what comes after the last on
 from __future__ import annotations
 
 from bisect import bisect
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import NamedTuple
@@ -20,6 +21,7 @@ from .payload import Anchor
 
 MOVED_MM = 5.0  # an anchor that moves by less, or
 TURNED = 0.0015  # rad turns by less, is not published again
+AT_ONCE = 100  # cycles that are carried in a tick: a few ms
 
 
 class Bend(NamedTuple):
@@ -42,8 +44,9 @@ class Drift:
         self.session = session
         self._said: dict[int, Anchor] = {}  # by the SLAM
         self._bent: dict[int, Anchor] = {}  # of these, as published, where that is elsewhere
-        self._fresh: list[Anchor] = []
+        self._due: deque[int] = deque()  # cycles that are to be carried anew
         self.bends: tuple[Bend, ...] = ()
+        self._at: list[int] = []  # the cycles of the bends
         self.version += 1
 
     def enter(self, said: Anchor) -> Anchor:
@@ -62,23 +65,27 @@ class Drift:
             return moved
         self._said |= {anchor.cycle: anchor for anchor in moved}
         back = self._bent.keys() - {anchor.cycle for anchor in moved}
-        self._bent, self._fresh, self.bends = {}, [], ()
+        self._bent, self.bends = {}, ()
+        self._due.clear()
         self.version += 1
         return moved + [self._said[cycle] for cycle in sorted(back)]
 
     def bend(self, bends: Iterable[Bend]) -> None:
-        """From now on this is known. `take` gives what it moves."""
+        """From now on this is known. `take` gives what it moves, a little in every tick."""
         self.bends = tuple(bends)
+        self._at = [bend.cycle for bend in self.bends]
+        self._due = deque(self._said)
         self.version += 1
-        for cycle, said in self._said.items():
-            anchor, before = self._carried(said), self._bent.get(cycle, said)
-            if _apart(matrix_of(anchor.pose), matrix_of(before.pose)):
-                self._bent[cycle] = anchor
-                self._fresh.append(anchor)
 
     def take(self) -> list[Anchor]:
         """What is to be published anew, handed over."""
-        out, self._fresh = self._fresh, []
+        out = []
+        for _ in range(min(len(self._due), AT_ONCE)):
+            said = self._said[self._due.popleft()]
+            anchor, before = self._carried(said), self._bent.get(said.cycle, said)
+            if _apart(matrix_of(anchor.pose), matrix_of(before.pose)):
+                self._bent[said.cycle] = anchor
+                out.append(anchor)
         return out
 
     def said(self, cycle: int) -> Floats | None:
@@ -90,7 +97,7 @@ class Drift:
         """(4, 4) mm what carries a cycle from where the SLAM has it to where it is."""
         if not self.bends:
             return np.eye(4)
-        after = bisect([bend.cycle for bend in self.bends], cycle)
+        after = bisect(self._at, cycle)
         one = self.bends[max(after - 1, 0)]
         other = self.bends[min(after, len(self.bends) - 1)]
         if one is other:
