@@ -50,7 +50,7 @@ fleet: $(DEMO)/.package
 
 test: check
 	NUMBA_DISABLE_JIT=1 $(TEST)/bin/python -m pytest -q -n 2 $(TWINS)
-	$(TEST)/bin/python -m pytest -n 2
+	$(TEST)/bin/python -m pytest -n 2 --dist worksteal
 
 check: $(TEST)/.package
 	$(TEST)/bin/ruff check .

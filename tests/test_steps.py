@@ -86,7 +86,7 @@ class Weakened:
         return Link(bandwidth=part * self.whole, queue=1 << 30)
 
 
-@pytest.mark.parametrize(("robots", "features", "whole"), [(3, 1500, 15_000.0)])
+@pytest.mark.parametrize(("robots", "features", "whole"), [(3, 1000, 10_000.0)])
 def test_the_link_drops_to_a_tenth(robots: int, features: int, whole: float) -> None:
     """Messages take less than a second again, and the fleet goes on with what the link carries."""
     limited = steered(robot_bytes_per_second=whole / 2)

@@ -215,6 +215,10 @@ class AdjacencyDag:
         """(N,) marked as issued."""
         return self._flagged(ids, lattice.ISSUED)
 
+    def open(self, ids: npt.ArrayLike | None = None) -> Bools:
+        """(N,) neither withdrawn nor issued: what may still go out."""
+        return ~self._flagged(ids, lattice.WITHDRAWN | lattice.ISSUED)
+
     @property
     def nbytes(self) -> int:
         """Bytes of all arrays, lattice and spare room included."""

@@ -97,7 +97,7 @@ class Issuance:
 
     def unissued(self) -> Int64s:
         """Nodes that are neither issued nor withdrawn, ascending."""
-        return np.flatnonzero(self.graph.alive() & ~self.graph.issued())
+        return np.flatnonzero(self.graph.open())
 
     def see_again(self, nodes: Int64s, cycle: int) -> None:
         """Nodes that the SLAM observed once more. Only the latest such cycle is kept a node."""
@@ -108,7 +108,7 @@ class Issuance:
     @property
     def waiting(self) -> bool:
         """Whether valid features have not gone out yet."""
-        return bool(self._open(self._ripe).any())
+        return bool(self.graph.open(self._ripe).any())
 
     def batch(self, now: float, allowed: Allowance, known: Known) -> Batch | None:
         """What may go out now, or None. Marks it as issued; the caller must send it.
@@ -165,7 +165,7 @@ class Issuance:
             return ALL
         if self._sealed_at is not None and now - self._sealed_at < _PART:
             return 0
-        waiting = np.count_nonzero(self._open(self._ripe))
+        waiting = np.count_nonzero(self.graph.open(self._ripe))
         parts = max(1, round((self._cycle_at + self._period - now) / _PART))
         return max(_WORTH, math.ceil(waiting / parts)) if waiting else ALL
 
@@ -173,7 +173,7 @@ class Issuance:
         """Cores, newest first, each with its unissued ascendants, until the limit is reached."""
         if len(self._ripe) == 0:
             return self._ripe
-        cores = self._ripe[self._open(self._ripe)]
+        cores = self._ripe[self.graph.open(self._ripe)]
         cores = distinct(cores)[::-1]
         if len(cores) > limit:
             cores = self._news_first(cores, limit, known)
@@ -191,9 +191,6 @@ class Issuance:
         looked = cores[: _LOOK * limit]
         repeats = known(self.graph.positions(looked))
         return np.concatenate([looked[~repeats], cores[len(looked) :], looked[repeats]])
-
-    def _open(self, nodes: Int64s) -> Bools:
-        return np.asarray(self.graph.alive(nodes) & ~self.graph.issued(nodes))
 
     def _ripen(self, nodes: Int64s) -> None:
         if len(nodes):

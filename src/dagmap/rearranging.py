@@ -98,7 +98,7 @@ class Rearranging:
         if not runs:
             del self._moving[cycle]
         rows = np.arange(first, stop, dtype=np.int64)
-        rows = rows[self._graph.alive(rows) & ~self._graph.issued(rows)]
+        rows = rows[self._graph.open(rows)]
         if len(rows):
             self._issuance.revalue(self._graph.withdraw(rows))
             self._insert_again(cycle, pose, rows)
