@@ -47,3 +47,9 @@ def test_while_the_agent_is_loaded() -> None:
 def test_where_interrupts_are_ignored() -> None:
     code, said = interrupted("typer", "signal.SIG_IGN")
     assert code == 2 and "robot.toml" in said
+
+
+def test_as_a_module() -> None:
+    command = [sys.executable, "-m", "dagmap", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0 and done.stdout.startswith("dagmap ")
