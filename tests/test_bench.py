@@ -48,3 +48,12 @@ def test_bench_refuses_what_it_does_not_know(tmp_path: Path) -> None:
     assert done.returncode == 2 and "no benchmark called nonsense" in done.stderr
     done = bench(tmp_path, "overhead", "--dir", str(BENCH), DAGMAP_BENCH_MOST="few")
     assert done.returncode == 2 and "DAGMAP_BENCH_MOST = 'few'" in done.stderr
+
+
+def test_every_benchmark_fits_the_sources_that_are_here() -> None:
+    """Those of the bench folder that nothing else runs would notice too late what has moved."""
+    names = sorted(path.stem for path in BENCH.glob("*.py"))
+    assert len(names) > 20
+    code = f"import sys; sys.path.insert(0, {str(BENCH)!r})\nimport {', '.join(names)}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
