@@ -104,7 +104,9 @@ def load(folder: Path, cache: Path) -> Walk:
 def _extract(folder: Path, camera: Camera) -> dict[str, npt.NDArray[np.generic]]:
     """Every third frame of three ranges with its ORB points, and the cloud of all depths."""
     cycles = list(open_source(folder))
-    depths = {float(words[2]): folder / words[3] for _, words in _rows(folder)}
+    depths = {
+        float(row.words[2]): folder / row.words[3] for row in read_rows(folder / "associations.txt")
+    }
     bounds = [len(cycles) // ROBOTS + (r < len(cycles) % ROBOTS) for r in range(ROBOTS)]
     ends = np.cumsum(bounds)
     cv2 = import_cv2(folder)
@@ -130,10 +132,6 @@ def _extract(folder: Path, camera: Camera) -> dict[str, npt.NDArray[np.generic]]
         "depth": np.array(coarse),
         "dense": thin(np.concatenate(dense)),
     }
-
-
-def _rows(folder: Path) -> list[tuple[int, list[str]]]:
-    return read_rows(folder / "associations.txt")
 
 
 def _unproject(depth: Points, camera: Camera, step: int) -> Points:
