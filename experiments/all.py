@@ -20,11 +20,11 @@ from dagmap.cli.kernels import warm_up
 # What takes longest first.
 ALL = (
     "figure_11",
-    "section_5",
-    "completion",
     "sensors",
-    "feature_poor",
+    "completion",
+    "section_5",
     "figure_10",
+    "feature_poor",
     "agreement",
     "figure_07",
 )

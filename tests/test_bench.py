@@ -33,7 +33,8 @@ def test_bench_overhead_measures_and_predicts(tmp_path: Path) -> None:
     assert [row["measured_ms"] is None for row in sizes] == [False] * 2 + [True] * 3
     assert all(row["own_ms"] > 0 and row["paper_printed_ms"] > 0 for row in sizes)
     for cost in ("insert_us", "send_us", "merge_us", "l_dist_ns"):  # told apart
-        assert sizes[0][cost] > 0
+        assert all(row[cost] > 0 for row in rows if "learnt_from" in row)
+    assert [row["learnt_from"] for row in rows if "learnt_from" in row] == ["n_u", "n_c", "n_g"]
     steering = [row for row in rows if row.get("name") == "steering"]
     assert [row["peers"] for row in steering] == [0, 3, 30]
     assert all(row["ms_a_cycle"] > 0 for row in steering)
@@ -47,3 +48,12 @@ def test_bench_refuses_what_it_does_not_know(tmp_path: Path) -> None:
     assert done.returncode == 2 and "no benchmark called nonsense" in done.stderr
     done = bench(tmp_path, "overhead", "--dir", str(BENCH), DAGMAP_BENCH_MOST="few")
     assert done.returncode == 2 and "DAGMAP_BENCH_MOST = 'few'" in done.stderr
+
+
+def test_every_benchmark_fits_the_sources_that_are_here() -> None:
+    """Those of the bench folder that nothing else runs would notice too late what has moved."""
+    names = sorted(path.stem for path in BENCH.glob("*.py"))
+    assert len(names) > 20
+    code = f"import sys; sys.path.insert(0, {str(BENCH)!r})\nimport {', '.join(names)}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -152,9 +152,17 @@ def test_features_are_counted_in_the_second_in_which_they_fall() -> None:
     assert bins.edges.tolist() == [0, 1, 2, 3, 4]
 
 
+def test_no_burst_of_a_long_mission_is_averaged_away() -> None:
+    at = np.arange(0.0, 4000.0, 5.0)  # 400 features every five seconds, which is too much to show
+    bins = _Bins.over([at, np.array([3999.0])])
+    shown = bins.largest(bins.count(at, np.full(len(at), 400)))
+    assert len(shown) + 1 == len(bins.edges) <= 1201
+    assert shown.max() == 400.0 and bins.edges[-1] == 4000.0
+
+
 def test_robots_whose_clocks_are_years_apart_do_not_take_all_memory() -> None:
     bins = _Bins.over([np.array([0.0, 2e9])])
-    assert bins.number <= 1300
+    assert bins.number <= 1_000_001 and len(bins.edges) <= 1201
     assert bins.count(np.array([0.0, 2e9]), np.array([3, 4])).sum() == 7
 
 

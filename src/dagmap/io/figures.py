@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 _MERGED, _UNSENT, _REJECTED = "#8a2fb8", "#b4b4b4", "#e0261b"
 _SHOWN = 8  # robots that have a panel of their own in the traffic figure
 _BLUE = "#2166d1"  # traffic with DAGmap
+_COUNTED, _DRAWN = 1_000_000, 1200  # bins of the traffic figure, and steps to draw them in
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,18 +193,20 @@ def _edges(graphs: Sequence[GraphLayer]) -> tuple[Int64s, Int64s, Floats]:
 
 @dataclass(frozen=True, slots=True)
 class _Bins:
-    """Seconds to count features in; where they are too many to show, longer spans of time."""
+    """Seconds to count features in; where they are too many to show, the largest of several."""
 
     start: float
-    width: float
+    width: float  # s, of a bin: 1, or more in what lasts for weeks
     number: int
+    step: int  # bins that are drawn as one
 
     @classmethod
     def over(cls, times: Sequence[Floats]) -> _Bins:
         at = np.concatenate([np.zeros(0), *times])
         start, end = (at.min(), at.max()) if len(at) else (0.0, 0.0)
-        width = max(1.0, float(np.ceil((end - start) / 1200)))
-        return cls(float(start), width, int((end - start) // width) + 1)
+        width = max(1.0, float(np.ceil((end - start) / _COUNTED)))
+        number = int((end - start) // width) + 1
+        return cls(float(start), width, number, -(-number // _DRAWN))
 
     @property
     def zeros(self) -> Floats:
@@ -211,7 +214,13 @@ class _Bins:
 
     @property
     def edges(self) -> Floats:
-        return np.arange(self.number + 1, dtype=np.float64) * self.width
+        steps = np.append(np.arange(0, self.number, self.step), self.number)
+        return np.asarray(steps * self.width, np.float64)
+
+    def largest(self, counts: Floats) -> Floats:
+        """Features a second in the largest bin of each step, so that no burst is averaged away."""
+        steps = np.arange(0, self.number, self.step)
+        return np.asarray(np.maximum.reduceat(counts, steps) / self.width, np.float64)
 
     def count(self, at: Floats, counts: Int64s) -> Floats:
         """Features in each bin."""
@@ -221,7 +230,7 @@ class _Bins:
 
 
 def _draw_rates(axis: Axes, name: str, bins: _Bins, without: Floats, with_it: Floats) -> None:
-    grey, blue = without / bins.width, with_it / bins.width
+    grey, blue = bins.largest(without), bins.largest(with_it)
     axis.stairs(grey, bins.edges, baseline=1e-3, fill=True, color="#d6d6d6", zorder=1)
     axis.stairs(blue, bins.edges, baseline=1e-3, fill=True, color=_BLUE, alpha=0.22, zorder=2)
     axis.stairs(blue, bins.edges, baseline=None, color=_BLUE, linewidth=1.0, zorder=3)
@@ -247,6 +256,7 @@ def _finish_rates(axes: Sequence[Axes], bins: _Bins) -> None:
         axis.spines[["top", "right"]].set_visible(False)
         axis.tick_params(labelbottom=axis is axes[-1], which="both", width=0.5)
         axis.set_ylabel("features / s")
-    axes[-1].set_xlabel("time, s")
+    spans = "" if bins.step == 1 else f"; of every {bins.step * bins.width:.0f} s the fullest one"
+    axes[-1].set_xlabel(f"time, s{spans}")
     entries = [("without DAGmap: every feature, when the SLAM puts it out", "#bdbdbd")]
     put_legend(axes[-1], [*entries, ("with DAGmap: features in transactions", _BLUE)], below=-0.42)
