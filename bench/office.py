@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from dagmap.io.sources import open_source
-from dagmap.io.sources._rgbd import Camera, import_cv2, load_camera
 from dagmap.io.sources._lists import read_rows
+from dagmap.io.sources._rgbd import Camera, import_cv2, load_camera
 from dagmap.metrics import thin
 from dagmap.model import Cycle
 
