@@ -177,6 +177,21 @@ def test_a_correction_under_way_ends_where_the_slam_corrects_itself() -> None:
     assert {anchor.pose[5] for anchor in back} == {0} and drift.take() == []
 
 
+def done(work, *given):  # type: ignore[no-untyped-def]
+    """What work in small pieces comes to."""
+    return done_in(work, *given)[0]
+
+
+def done_in(work, *given):  # type: ignore[no-untyped-def]
+    """The same, and the units of each piece."""
+    going, pieces = work(*given), []
+    while True:
+        try:
+            pieces.append(next(going))
+        except StopIteration as end:
+            return end.value, pieces
+
+
 def path(count: int = 8) -> Path:
     said = np.array([np.eye(4)] * count)
     said[:, 0, 3] = 500.0 * np.arange(count)
@@ -196,7 +211,7 @@ def look(own: int, off: float, other: int | None = None) -> Look:
 
 def test_drift_is_found_and_carried_on() -> None:
     looks = [look(k, 20.0 * k) for k in range(6)]
-    motions = bent(path(), looks, FOLLOWING)
+    motions = done(bent, path(), looks, FOLLOWING)
     assert motions is not None
     said = path().said
     moved = (motions @ said - said)[:, 1, 3]
@@ -205,27 +220,27 @@ def test_drift_is_found_and_carried_on() -> None:
 
 
 def test_more_than_drift_is_not_followed() -> None:
-    assert bent(path(), [look(k, 400.0) for k in range(6)], FOLLOWING) is not None
-    assert bent(path(), [look(k, 900.0) for k in range(6)], FOLLOWING) is None
+    assert done(bent, path(), [look(k, 400.0) for k in range(6)], FOLLOWING) is not None
+    assert done(bent, path(), [look(k, 900.0) for k in range(6)], FOLLOWING) is None
 
 
 def test_a_few_looks_are_not_enough() -> None:
-    assert bent(path(), [look(k, 60.0) for k in range(3)], FOLLOWING) is None
-    assert bent(path(), [look(0, 60.0 + k) for k in range(9)], FOLLOWING) is None
+    assert done(bent, path(), [look(k, 60.0) for k in range(3)], FOLLOWING) is None
+    assert done(bent, path(), [look(0, 60.0 + k) for k in range(9)], FOLLOWING) is None
 
 
 def test_a_look_counts_where_another_bears_it_out() -> None:
     one, other, alone = look(1, 50.0), look(2, 60.0), look(3, -200.0)
-    assert borne_out([one, other, alone], 80.0) == [one, other]
+    assert done(borne_out, [one, other, alone], 80.0) == [one, other]
     same = look(2, 60.0, other=1)  # the same keyframe of the others
-    assert borne_out([one, same], 80.0) == []
-    assert borne_out([one, look(7, 60.0)], 80.0) == [], "too far along the path"
+    assert done(borne_out, [one, same], 80.0) == []
+    assert done(borne_out, [one, look(7, 60.0)], 80.0) == [], "too far along the path"
 
 
 def test_a_look_that_contradicts_the_others_is_left_out() -> None:
     looks = [look(k, 60.0) for k in range(6)]
-    with_one_off = bent(path(), [*looks, look(3, -300.0)], FOLLOWING)
-    without = bent(path(), looks, FOLLOWING)
+    with_one_off = done(bent, path(), [*looks, look(3, -300.0)], FOLLOWING)
+    without = done(bent, path(), looks, FOLLOWING)
     assert with_one_off is not None and without is not None
     assert np.abs(with_one_off - without).max() < 1.0
 
@@ -247,5 +262,42 @@ def test_blocks_are_solved_as_the_whole() -> None:
 
 
 def test_a_step_fits_what_is_seen_where_nothing_holds_it() -> None:
-    change = solved(path(), [look(k, 10.0) for k in range(8)], FOLLOWING)
+    change = done(solved, path(), [look(k, 10.0) for k in range(8)], FOLLOWING)
     assert np.allclose(change[:, 4], 10.0, atol=0.01) and np.abs(change[:, :3]).max() < 1e-5
+
+
+def turned_look(own: int, angle: float) -> Look:
+    source = np.random.default_rng(own).uniform(-2000, 2000, (20, 3))
+    turn = pose(yaw=angle)
+    return Look(own, own, source, source @ turn[:3, :3].T, turn)
+
+
+def test_a_robot_that_stands_still_is_not_turned() -> None:
+    """Where nothing is driven nothing drifts: others cannot turn what it sees by 20 cm."""
+    still = path()
+    said = np.array([np.eye(4)] * 8)
+    views = Views(said, still.views.points, still.views.descriptors, 2000.0)
+    still = Path(still.cycles, said, still.motions, views)
+    assert done(bent, still, [turned_look(k, 0.1) for k in range(8)], FOLLOWING) is None
+    assert done(bent, still, [turned_look(k, 0.04) for k in range(8)], FOLLOWING) is not None
+
+
+def test_many_looks_that_contradict_each_other_are_judged_bit_by_bit() -> None:
+    looks = [look(k // 4, 500.0 * k, other=k) for k in range(40)]
+    kept, pieces = done_in(borne_out, looks, 80.0)
+    assert kept == [] and max(pieces) == 1 and len(pieces) >= 40
+    _, pieces = done_in(bent, path(100), [look(k // 4, 60.0) for k in range(400)], FOLLOWING)
+    assert max(pieces) == 1 and len(pieces) >= 100 and min(pieces) > 0
+
+
+def test_a_restored_robot_follows_the_drift_of_its_newest_session() -> None:
+    one = agent("bob", CONFIG)
+    for session in (0, 3):
+        for at, cycle in enumerate(walk(START, 0.0, 1, 3)):
+            named = Cycle(float(at), cycle.pose, cycle.points, session=session)
+            one.observe(named, float(at + 10 * session))
+    for at in range(60, 70):
+        one.tick(float(at))
+    data = [tx.data for tx in one.ledger]
+    back = type(one).restore(one.identity, one.config, data)
+    assert back.observing.session == back.observing.drift.session == 3

@@ -42,6 +42,7 @@ NOISE = 0.25  # of the tolerance: how far off a described point is, and
 WORTH = 6  # points of a look count, for all of them share an error
 NEWS = 0.25  # of the tolerance: what fewer keyframes than `LOOKS` are off by is no news
 TRUSTED = 3  # times the drift that is allowed: what is off by more is no drift
+SOLVED = 5  # looks or steps of the path that enter the equations in a unit
 GROWN = 1.1  # keyframes must have grown by so much before it is looked again
 
 
@@ -131,8 +132,8 @@ class Bending:
             self._looked, self._counted = self._state(), self._counts(count)
             others = self._others()
             looks = yield from seek(path.views, others, self._config.tolerance_mm)
-            motions = bent(path, looks, self._config)
-            yield 1 + len(path.cycles) // 8
+            motions = yield from bent(path, looks, self._config)
+            yield 1
             if motions is not None and version == self._drift.version:
                 self._drift.bend(map(Bend, path.cycles, motions))
 
@@ -190,7 +191,8 @@ def seek(own: Views, others: Views, tolerance: float) -> Working[list[Look]]:
                 found[k] = yield from _looks(own, others, k, guess, tolerance)
             if found[k]:
                 guess = max(found[k], key=lambda look: len(look.source)).motion
-    return borne_out([look for k in sorted(found) for look in found[k]], tolerance)
+    every = [look for k in sorted(found) for look in found[k]]
+    return (yield from borne_out(every, tolerance))
 
 
 def _looks(
@@ -212,28 +214,29 @@ def _looks(
     return out
 
 
-def borne_out(looks: list[Look], tolerance: float) -> list[Look]:
+def borne_out(looks: list[Look], tolerance: float) -> Working[list[Look]]:
     """Those that another one agrees with: of a keyframe near by, with another one of others."""
-    return [
-        look
-        for look in looks
+    out = []
+    for look in looks:
         if any(
             0 < abs(look.own - other.own) <= NEIGHBOURS
             and look.other != other.other
             and residuals(other.motion, look.source, look.target).mean() <= tolerance
             for other in looks
-        )
-    ]
+        ):
+            out.append(look)
+        yield 1
+    return out
 
 
-def bent(path: Path, looks: list[Look], config: PlacingConfig) -> Floats | None:
+def bent(path: Path, looks: list[Look], config: PlacingConfig) -> Working[Floats | None]:
     """(K, 4, 4) the motions by which the looks agree better; None where that is no news, or where
     it is more than drift."""
     tolerance, places = config.tolerance_mm, path.views.poses[:, :3, 3]
     for _ in range(2):
         if len(looks) < LOOKS:
             return None
-        change = solved(path, looks, config)
+        change = yield from solved(path, looks, config)
         moves = [small(change[look.own], places[look.own]) for look in looks]
         fitting = [
             look
@@ -252,17 +255,21 @@ def bent(path: Path, looks: list[Look], config: PlacingConfig) -> Floats | None:
     steps = [small(c, place) for c, place in zip(change, places, strict=True)]
     motions = np.array(steps) @ path.motions
     off = np.linalg.norm((motions @ path.said - path.said)[:, :3, 3], axis=1)
+    turned = (np.trace(motions[:, :3, :3], axis1=1, axis2=2) - 1) / 2
+    off += path.views.depth * np.arccos(np.clip(turned, -1, 1))  # what is seen, not the sensor only
     if off.max() > TRUSTED * config.drift * path.lengths().sum() + tolerance:
         return None
     return motions
 
 
-def solved(path: Path, looks: list[Look], config: PlacingConfig) -> Floats:
+def solved(path: Path, looks: list[Look], config: PlacingConfig) -> Working[Floats]:
     """(K, 6) turn (rad) about each sensor, and shift (mm): a Gauss-Newton step."""
     count = len(path.cycles)
     diagonal, beside = np.zeros((count, 6, 6)), np.zeros((count - 1, 6, 6))
     right = np.zeros((count, 6))
-    for look in looks:
+    for n, look in enumerate(looks):
+        if n % SOLVED == 0:
+            yield 1
         arms = look.source - path.views.poses[look.own, :3, 3]
         jacobian = np.zeros((len(arms), 3, 6))
         jacobian[:, :, :3] = -_cross(arms)
@@ -273,6 +280,8 @@ def solved(path: Path, looks: list[Look], config: PlacingConfig) -> Floats:
         right[look.own] += weight * flat.T @ (look.target - look.source).ravel()
     lengths = np.maximum(path.lengths(), config.tolerance_mm)
     for k, length in enumerate(lengths.tolist()):
+        if k % SOLVED == 0:
+            yield 1
         ahead, lacking = _drifted(path, k)
         off = config.drift * length
         firm = np.array([path.views.depth / off] * 3 + [1 / off] * 3) ** 2

@@ -83,6 +83,7 @@ class Observing:
                     self._cycle_of = {}
                 self.session = anchor.session
                 self._cycle_of[anchor.stamp] = anchor.cycle
+        self.drift.start(self.session)
 
     def check(self, cycle: QuantisedCycle) -> QuantisedCycle:
         """What only this robot's history can tell. Raises CycleError; changes nothing."""
