@@ -8,6 +8,7 @@ what comes out are poses that their author signs.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -42,7 +43,8 @@ NOISE = 0.25  # of the tolerance: how far off a described point is, and
 WORTH = 6  # points of a look count, for all of them share an error
 NEWS = 0.25  # of the tolerance: what fewer keyframes than `LOOKS` are off by is no news
 TRUSTED = 3  # times the drift that is allowed: what is off by more is no drift
-SOLVED = 5  # looks or steps of the path that enter the equations in a unit
+HELD = 16  # looks that are held against others in a unit
+SOLVED = 8  # looks or steps of the path that enter the equations in a unit
 GROWN = 1.1  # keyframes must have grown by so much before it is looked again
 
 
@@ -216,16 +218,21 @@ def _looks(
 
 def borne_out(looks: list[Look], tolerance: float) -> Working[list[Look]]:
     """Those that another one agrees with: of a keyframe near by, with another one of others."""
-    out = []
+    of: defaultdict[int, list[Look]] = defaultdict(list)
     for look in looks:
-        if any(
-            0 < abs(look.own - other.own) <= NEIGHBOURS
-            and look.other != other.other
-            and residuals(other.motion, look.source, look.target).mean() <= tolerance
-            for other in looks
-        ):
-            out.append(look)
-        yield 1
+        of[look.own].append(look)
+    out, held_against = [], 0
+    for look in looks:
+        near = range(look.own - NEIGHBOURS, look.own + NEIGHBOURS + 1)
+        for other in (each for k in near if k != look.own for each in of.get(k, ())):
+            if look.other == other.other:
+                continue
+            held_against += 1
+            if held_against % HELD == 0:
+                yield 1
+            if residuals(other.motion, look.source, look.target).mean() <= tolerance:
+                out.append(look)
+                break
     return out
 
 
