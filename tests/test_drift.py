@@ -12,7 +12,7 @@ from dagmap.bending import _tridiagonal as tridiagonal
 from dagmap.config import PlacingConfig
 from dagmap.drift import Bend, Drift
 from dagmap.messages import Transactions, encode
-from dagmap.model import ConfigError, FrameId, pose_matrix, quantise_pose
+from dagmap.model import ConfigError, CycleError, FrameId, pose_matrix, quantise_pose
 from dagmap.payload import Anchor
 from dagmap.registration import Views
 from dagmap.sim.fleet import Fleet
@@ -290,14 +290,36 @@ def test_many_looks_that_contradict_each_other_are_judged_bit_by_bit() -> None:
     assert max(pieces) == 1 and len(pieces) >= 50 and min(pieces) > 0
 
 
-def test_a_restored_robot_follows_the_drift_of_its_newest_session() -> None:
-    one = agent("bob", CONFIG)
-    for session in (0, 3):
-        for at, cycle in enumerate(walk(START, 0.0, 1, 3)):
-            named = Cycle(float(at), cycle.pose, cycle.points, session=session)
-            one.observe(named, float(at + 10 * session))
-    for at in range(60, 70):
-        one.tick(float(at))
-    data = [tx.data for tx in one.ledger]
-    back = type(one).restore(one.identity, one.config, data)
-    assert back.observing.session == back.observing.drift.session == 3
+def test_a_new_session_leaves_no_correction_half_done() -> None:
+    """All of the old one lies where it was found to be, though only a part fits into a tick."""
+    bob = agent("bob", CONFIG)
+    for at in range(250):
+        bob.observe(Cycle(float(at), pose(0.1 * at), np.ones((1, 3))), float(at))
+    bob.observing.drift.bend([Bend(0, shifted(40.0))])
+    bob.tick(250.0)
+    bob.observe(Cycle(300.0, np.eye(4), np.ones((1, 3)), session=1), 300.0)
+    for at in range(300, 330):
+        bob.tick(float(at))
+    anchors = [anchor for tx in bob.ledger for anchor in tx.payload.anchors]
+    newest = placed(anchors)  # the last one of a cycle counts
+    assert newest == {cycle: [100 * cycle, 40, 0] for cycle in range(250)} | {250: [0, 0, 0]}
+
+
+def test_a_restored_robot_begins_a_new_session() -> None:
+    """How far its SLAM had drifted is not in the ledger: cycles would jump back."""
+    bob = agent("bob", CONFIG)
+    for at, cycle in enumerate(walk(START, 0.0, 1, 3)):
+        bob.observe(cycle, float(at))
+    bob.tick(60.0)
+    data = [tx.data for tx in bob.ledger]
+    back = type(bob).restore(bob.identity, bob.config, data)
+    with pytest.raises(
+        CycleError, match="session 0 was begun before a restart.*start a new session"
+    ):
+        back.observe(Cycle(70.0, np.eye(4), np.ones((1, 3))), 70.0)
+    back.observe(Cycle(70.0, np.eye(4), np.ones((1, 3)), session=1), 70.0)
+    back.observe(Cycle(71.0, np.eye(4), np.ones((1, 3)), session=1), 71.0)
+    with pytest.raises(CycleError, match="start a new session"):
+        back.observe(Cycle(72.0, np.eye(4), np.ones((1, 3))), 72.0)
+    plain = type(bob).restore(bob.identity, QUICK, [])
+    plain.observe(Cycle(70.0, np.eye(4), np.ones((1, 3))), 70.0)

@@ -43,6 +43,7 @@ NOISE = 0.25  # of the tolerance: how far off a described point is, and
 WORTH = 6  # points of a look count, for all of them share an error
 NEWS = 0.25  # of the tolerance: what fewer keyframes than `LOOKS` are off by is no news
 TRUSTED = 3  # times the drift that is allowed: what is off by more is no drift
+CARRIED = 16  # keyframes of others that are laid in the own frame in a unit
 HELD = 16  # looks that are held against others in a unit
 SOLVED = 8  # looks or steps of the path that enter the equations in a unit
 GROWN = 1.1  # keyframes must have grown by so much before it is looked again
@@ -132,7 +133,7 @@ class Bending:
                 continue
             version = self._drift.version
             self._looked, self._counted = self._state(), self._counts(count)
-            others = self._others()
+            others = yield from self._others()
             looks = yield from seek(path.views, others, self._config.tolerance_mm)
             motions = yield from bent(path, looks, self._config)
             yield 1
@@ -171,12 +172,17 @@ class Bending:
         views = Views(poses, points, [keyframe.descriptors for keyframe, _ in known], depth)
         return Path(cycles, said, motions, views)
 
-    def _others(self) -> Views:
+    def _others(self) -> Working[Views]:
         """All keyframes of the others, in the own frame."""
         held = [(place, k) for frame, place in self._places.items() for k in self._keyframes[frame]]
+        points = []
+        for n, (place, keyframe) in enumerate(held):
+            if n % CARRIED == 0:
+                yield 1
+            points.append(carry(place, keyframe.points))
         return Views(
             np.array([place @ keyframe.place for place, keyframe in held]),
-            [carry(place, keyframe.points) for place, keyframe in held],
+            points,
             [keyframe.descriptors for _, keyframe in held],
             float(np.median([keyframe.depth for _, keyframe in held])),
         )

@@ -251,6 +251,9 @@ class PlacingConfig(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
         self._require_range("keyframe_turn", 1.0, 180.0)
         self._require_range("inliers", 12, 1 << 20)
         self._require_range("drift", 0.0, 0.1)
+        self._require(
+            self.drift == 0 or self.drift >= 1e-4, "drift", "0, or 0.0001 at least, is wanted"
+        )
         self._require_range("units_per_tick", 1, 10_000)
 
     @property

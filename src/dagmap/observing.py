@@ -55,6 +55,7 @@ class Observing:
         self._anchors: list[Anchor] = []  # to be published
         self._anchors_since: float | None = None  # `now` at the first of them
         self._moved: list[Anchor] = []  # to be published anew
+        self._entered: int | None = None  # the session that goes on, if it began in this run
         self._retracted: list[Int64s] = []
         self._links: list[Link] = []
         self._keyframes = Keyframes(config.placing)
@@ -83,7 +84,6 @@ class Observing:
                     self._cycle_of = {}
                 self.session = anchor.session
                 self._cycle_of[anchor.stamp] = anchor.cycle
-        self.drift.start(self.session)
 
     def check(self, cycle: QuantisedCycle) -> QuantisedCycle:
         """What only this robot's history can tell. Raises CycleError; changes nothing."""
@@ -95,6 +95,12 @@ class Observing:
                 f"{last / 1e6:.6f} s; hand cycles in by time, or start a new session"
             )
         fresh = cycle.session != self.session
+        if self.drift.rate and last is not None and cycle.session != self._entered:
+            raise CycleError(
+                f"{where}: session {cycle.session} was begun before a restart or another session, "
+                "and where its SLAM had drifted to is not known any more ([placing] drift); "
+                "start a new session"
+            )
         unknown = cycle.removed if fresh else self._arrangement.unknown(cycle.removed)
         if len(unknown):
             raise CycleError(
@@ -267,12 +273,16 @@ class Observing:
         """A session begins: the first one at the start pose, a later one unknown or as before."""
         before = FrameId(self._author, self.session)
         if self._sessions:
+            while (
+                more := self.drift.take()
+            ):  # what was found of the old session holds for all of it
+                self._lay(more)
             self.rearrange(1 << 40)
             self.catch_up(_nothing, len(self.backlog))
             if self.issuance.waiting:
                 self._earlier.append(self.issuance)
             self._start_frame()
-        self.session = session
+        self.session = self._entered = session
         self._keyframes.start()
         self.drift.start(session)
         if session in self._sessions:

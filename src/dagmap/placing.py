@@ -52,7 +52,7 @@ class Placing:
             return [], False  # everybody shares one frame
         self._take_in(ledger, consensus)
         # first, since drift that is left would look like another way to place the frame
-        share = self._config.units_per_tick // 2
+        share = -(-self._config.units_per_tick // 2)
         self.spent += self._bending.step(self._keyframes, consensus, self._moves, share)
         links = self._search(consensus)
         if self._config.surfaces:

@@ -188,7 +188,10 @@ class Replay:
         names, features, poses, layers = [], [], [], []
         for robot in placed:
             track, frame = self._tracks[robot.name], robot.agent.frame()
-            frame = np.eye(4) if frame is None else frame
+            drift = (
+                robot.agent.observing.drift.now
+            )  # in the newest pose only: the DAG has it already
+            frame = np.eye(4) if frame is None else frame @ np.linalg.inv(drift)
             names.append(robot.name)
             points = np.concatenate([np.zeros((0, 3)), *track.points])
             features.append(points @ frame[:3, :3].T + frame[:3, 3])
